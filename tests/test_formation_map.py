@@ -54,7 +54,7 @@ from wholearm.mapping.formation_map import (
 from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning.lower_bound import look_along
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.search.edges import Link, cut_curve
+from wholearm.search.edges import Edge, cut_curve
 from wholearm.search.places import is_at, make_place
 from wholearm.search.roadmap import Roadmap
 
@@ -720,26 +720,26 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
     until = [str(phase.until) for phase in phases]
     (own,) = (
-        link
-        for _, link, _ in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
-        if isinstance(link, Link) and [str(step.until) for step in link.steps] == until
+        edge
+        for _, edge, _ in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
+        if isinstance(edge, Edge) and [str(step.until) for step in edge.steps] == until
     )
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
     took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
     assert own.bound <= took * (1 + 1e-6)
-    assert own.duration == pytest.approx(took, rel=1e-2)
+    assert own.estimate == pytest.approx(took, rel=1e-2)
     # A stop at each crossing takes longer, by what the plan says that the impacts save.
     alone, place = 0.0, make_place(problem.scene, problem.start)
     for phase in phases:
-        (link,) = (
-            link
+        (edge,) = (
+            edge
             for chain in chart.follow(place)
-            if isinstance(link := chain.link, Link)
+            if isinstance(edge := chain.edge, Edge)
             and set(chain.borders[0].formation.contacts) == set(phase.formation.contacts)
-            and link.steps[0].until == phase.until
+            and edge.steps[0].until == phase.until
         )
-        alone, place = alone + link.duration, link.stop
-    assert alone > 1.2 * own.duration
+        alone, place = alone + edge.estimate, edge.stop
+    assert alone > 1.2 * own.estimate
 
 
 def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
@@ -763,10 +763,10 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
     (border,) = (own for own in borders if set(own.formation.contacts) == contacts)
     landings = chart.land_at(chart.release(border, borders), goal)
     assert landings
-    for link in landings:
-        assert is_at(link.stop, goal) and str(link.steps[-1].until) == "v2-palm at x = 0.022 m"
-        assert [step.end for step in link.steps] == [End.SMOOTH, End.REST]
-        gaps = Formation(problem.scene, link.stop.contacts).evaluate(*[link.stop.z[None]] * 2).C
+    for edge in landings:
+        assert is_at(edge.stop, goal) and str(edge.steps[-1].until) == "v2-palm at x = 0.022 m"
+        assert [step.end for step in edge.steps] == [End.SMOOTH, End.REST]
+        gaps = Formation(problem.scene, edge.stop.contacts).evaluate(*[edge.stop.z[None]] * 2).C
         assert np.abs(gaps).max() < 1e-8 * problem.scene.scales.length
     assert chart.land_at(chart.release(border, borders), Goal(flush=1)) == []
 

@@ -56,7 +56,7 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
-from wholearm.search.edges import BorderEdge, Link, Terms, link_along
+from wholearm.search.edges import BorderEdge, Edge, Terms, edge_along
 from wholearm.search.places import make_place
 
 EPSILON = 0.05
@@ -759,8 +759,8 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     slow = curves[1]
     place = make_place(slow.formation.scene, slow.start)
     border = BorderEdge(place, slow, None, Terms(epsilon, 0.1))
-    link = link_along((border,), (1.0,), (), border.stop)
+    edge = edge_along((border,), (1.0,), (), border.stop)
     # A crawl through that place on the first grid is a tenth too slow; 1 would be no estimate.
-    assert isinstance(link, Link) and link.duration == pytest.approx(
+    assert isinstance(edge, Edge) and edge.estimate == pytest.approx(
         look_along([slow], epsilon, 1000), rel=0.2
     )

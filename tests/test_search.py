@@ -49,16 +49,18 @@ from wholearm.search.astar import (
     Found,
     RefinedPath,
     ReleaseSearch,
-    RoadmapRoute,
     RouteSearch,
     bound_borders,
 )
+from wholearm.search.astar import (
+    Route as SearchRoute,
+)
 from wholearm.search.cuts import (
     describe_block,
+    edge_changed,
     explain_block,
     find_hand,
     find_opening,
-    link_changed,
     list_cut,
     list_cut_borders,
     list_openings,
@@ -66,12 +68,12 @@ from wholearm.search.cuts import (
 from wholearm.search.edge_plans import (
     BackgroundTask,
     Cache,
-    Measured,
-    PlannedLink,
+    CoarsePlan,
+    PlannedEdge,
     list_printed,
-    plan_links,
+    plan_edges,
 )
-from wholearm.search.edges import Link
+from wholearm.search.edges import Edge
 from wholearm.search.find_route import (
     find_route,
     format_phases,
@@ -98,7 +100,7 @@ def search(goal: Goal) -> RouteSearch:
 
 
 @cache
-def to_edge_6() -> tuple[RouteSearch, RoadmapRoute]:
+def to_edge_6() -> tuple[RouteSearch, SearchRoute]:
     own = search(Goal(flush=6))
     return own, next(own.run())
 
@@ -106,24 +108,24 @@ def to_edge_6() -> tuple[RouteSearch, RoadmapRoute]:
 def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
     _, route = to_edge_6()
     z, total = problem_of(HEPTAGON).start, 0.0
-    for link in route.links:
-        for step in link.steps:
+    for edge in route.edges:
+        for step in edge.steps:
             formation = Formation(chart().scene, step.contacts)
             curve = trace_phase(Phase(0, formation, step.until, step.end), z)
             bound = bound_least_time((curve,), chart().epsilon)
             assert bound is not None
             total, z = total + bound.value, curve.end
-        assert np.allclose(z, link.stop.z, atol=1e-9)
-    assert sum(link.bound for link in route.links) <= total * (1 + 1e-6)
-    assert route.duration == pytest.approx(total, rel=5e-3)
-    assert {c.name for c in route.links[-1].stop.contacts} >= {"v6-palm", "v0-palm"}
+        assert np.allclose(z, edge.stop.z, atol=1e-9)
+    assert sum(edge.bound for edge in route.edges) <= total * (1 + 1e-6)
+    assert route.estimate == pytest.approx(total, rel=5e-3)
+    assert {c.name for c in route.edges[-1].stop.contacts} >= {"v6-palm", "v0-palm"}
 
 
 def test_no_route_along_borders_is_faster() -> None:
     own, route = to_edge_6()
     bound = bound_borders(own, 1.0)
-    least = sum(link.fine_bound for link in route.links)
-    assert bound.complete and 0.99 * route.duration < bound.value <= least * (1 + 1e-9)
+    least = sum(edge.fine_bound for edge in route.edges)
+    assert bound.complete and 0.99 * route.estimate < bound.value <= least * (1 + 1e-9)
     assert bound_borders(own, 0.05).value == 0.05
     # A bound up to more says what one up to less does.
     assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
@@ -131,8 +133,8 @@ def test_no_route_along_borders_is_faster() -> None:
 
 def test_a_place_along_a_border_is_a_goal() -> None:
     route = next(search(Goal(flush=0, x=0.03)).run())
-    (link,) = route.links
-    assert abs(link.stop.z[0] - 0.03) < 1e-9 and link.steps[0].until.value == 0.03
+    (edge,) = route.edges
+    assert abs(edge.stop.z[0] - 0.03) < 1e-9 and edge.steps[0].until.value == 0.03
 
 
 def test_a_problem_with_a_goal_is_planned() -> None:
@@ -158,7 +160,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     problem = problem_of(HEPTAGON)
     own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
     again = next(own.run())
-    assert again.signature == route.signature and again.duration == route.duration
+    assert again.signature == route.signature and again.estimate == route.estimate
     (file,) = folder.iterdir()
     written = file.read_bytes()
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
@@ -198,7 +200,7 @@ def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
         find_route(read({"flush": 6}), time_limit=1e-9)
-    monkeypatch.setattr("wholearm.search.astar.plan_links", interrupt)
+    monkeypatch.setattr("wholearm.search.astar.plan_edges", interrupt)
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
 
@@ -240,8 +242,8 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
         PhasePlan(own, plan.trajectory.torque, own.duration) for own in plan.trajectory.motions
     ]
     block = BlockPlan(plan.problem.phases, plan.problem.start, planned, None)
-    links = [PlannedLink(plan.problem.phases, (block,))]
-    phases = list_printed(plan.problem.scene, links, guesses=True)
+    edges = [PlannedEdge(plan.problem.phases, (block,))]
+    phases = list_printed(plan.problem.scene, edges, guesses=True)
     printed = replace(plan.problem, phases=phases)
     again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
     over_time = [phase.number for phase in plan.phases if phase.modes]
@@ -267,14 +269,14 @@ def test_what_is_advised_opens_the_way() -> None:
         for cut, value in zip(cuts, opening.values, strict=True):
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
-                assert isinstance(link_changed(cut, change), Link)
+                assert isinstance(edge_changed(cut, change), Edge)
     text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
     assert next(
         RouteSearch(Roadmap(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
-    ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
+    ).estimate == pytest.approx(float(text.split()[-2]), rel=0.05)
     coarse = PlanOptions(intervals=20)
     with advising(lambda wanted: wanted.key == "friction.palm"):
         said = describe_block(own, [], text, lambda at: explain_block(rough, coarse, at))
@@ -308,10 +310,10 @@ OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
 def plan_all(
-    links: tuple[Link, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
-) -> list[PlannedLink]:
-    own = [(link, list[Measured]()) for link in links]
-    planned = plan_links(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
+    edges: tuple[Edge, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
+) -> list[PlannedEdge]:
+    own = [(edge, list[CoarsePlan]()) for edge in edges]
+    planned = plan_edges(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
     assert isinstance(planned, list), planned
     return planned
 
@@ -322,13 +324,13 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
         Roadmap(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6)
     )
     route = next(search.run())
-    assert len(route.links) > 1
+    assert len(route.edges) > 1
     kept: Cache = {}
     asides = [BackgroundTask(lambda: 7) for _ in range(2)]
-    one = plan_all(route.links, {}, 1, asides[0])
-    other = plan_all(route.links, kept, 2, asides[1])
+    one = plan_all(route.edges, {}, 1, asides[0])
+    other = plan_all(route.edges, kept, 2, asides[1])
     assert [own.result for own in asides] == [None, 7]
-    assert list(map(id, plan_all(route.links, kept, 1))) == list(map(id, other))
+    assert list(map(id, plan_all(route.edges, kept, 1))) == list(map(id, other))
     # Solves in another process may differ in the last bits, and by the solver's tolerance then.
     for mine, theirs in zip(one, other, strict=True):
         assert mine.duration == pytest.approx(theirs.duration, rel=1e-6)
@@ -342,15 +344,15 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     def plan(path: RefinedPath) -> Found:
         if path.move is None or path.move < end:
             return "no guess leads to a plan"
-        return Measured(1 + FINEST * abs(path.move - best), (), [])
+        return CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
 
-    found, *others = ReleaseSearch(plan, Measured(1 + FINEST * abs(best), (), [])).run()
+    found, *others = ReleaseSearch(plan, CoarsePlan(1 + FINEST * abs(best), (), [])).run()
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
 
 
 def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
-    """A link that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
+    """An edge that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
 
     def plan(path: RefinedPath) -> Found:
         if path.move is None:
@@ -358,12 +360,12 @@ def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None
         z = np.full((1, 5), float(path.move))
         motion = SimpleNamespace(duration=0.0, evaluate=lambda _: SimpleNamespace(z=z, z_dot=z))
         begun: Any = [SimpleNamespace(motion=motion)]
-        return Measured(1 + abs(path.move), (), begun)
+        return CoarsePlan(1 + abs(path.move), (), begun)
 
     to_go = CostToGo(heptagon.phases[0], lambda z: 2 * abs(float(z[0]) + 3))
     for cost, duration in ((None, 1), (to_go, 4)):
         start = plan(RefinedPath(0))
-        assert isinstance(start, Measured)
+        assert isinstance(start, CoarsePlan)
         assert ReleaseSearch(plan, start, cost).run()[0].duration == duration
 
 

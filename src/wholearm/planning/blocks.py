@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from ..common.errors import (
 )
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.tracing import split_blocks, trace_phase
+from ..geometry.tracing import CostToGo, split_blocks, trace_phase
 from ..mechanics.dynamics import measure_speed, metric_weights
 from ..mechanics.impact import Impact, compute_impact
 from ..mechanics.speed_sweep import NoMotionError
@@ -55,9 +55,6 @@ from .phase_plan import (
     runs_along_curves,
     share_duration,
 )
-
-if TYPE_CHECKING:
-    from ..geometry.tracing import CostToGo
 
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
@@ -387,16 +384,24 @@ def look_ahead(
     ):
         return None
 
+    if planning.sketches and options.goal is Objective.TIME:
+        return estimate_time_to_go(phase, problem.epsilon)
+
     def value(z: Array) -> float:
-        if planning.sketches and options.goal is Objective.TIME:
-            try:
-                return look_along((trace_phase(phase, z),), problem.epsilon, intervals=24)
-            except NoMotionError:
-                text = f"phase {phase.number}: no motion keeps the limits"
-                raise SolverError(text) from None
         return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
 
-    from ..geometry.tracing import CostToGo
+    return CostToGo(phase, value)
+
+
+def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
+    """Estimated least time [s] of a phase with one freedom, as a function of where it begins."""
+
+    def value(z: Array) -> float:
+        try:
+            return look_along((trace_phase(phase, z),), epsilon, intervals=24)
+        except NoMotionError:
+            text = f"phase {phase.number}: no motion keeps the limits"
+            raise SolverError(text) from None
 
     return CostToGo(phase, value)
 

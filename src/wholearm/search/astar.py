@@ -1,9 +1,9 @@
 """Best-first search (lazy A*) for routes from a place to a goal, their plans and lower bounds.
 
-Links along borders are evaluated when their place is expanded; links through cells, which cost more
+Edges along borders are evaluated when their place is expanded; edges through cells, which cost more
 time, wait in the queue with a heuristic lower bound. A greedy heuristic leads to a first plan, a
 more cautious one finds faster routes near the start. Routes are planned in the order of their
-estimated durations; a pattern search finds where their links leave borders for cells.
+estimated durations; a pattern search finds where their edges leave borders for cells.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from ..planning.result import Plan
 from ..problem.definition import Goal, Problem
 from .edge_plans import (
     BackgroundTask,
+    CoarsePlan,
     Lost,
-    Measured,
     list_printed,
     look_ahead,
-    measure_link,
-    plan_links,
+    plan_coarsely,
+    plan_edges,
     plan_phases,
     time_with,
 )
-from .edges import ROUGHLY, Blocked, Link, describe_steps, leave_at
+from .edges import ROUGHLY, Blocked, Edge, describe_steps, leave_at
 from .places import Key, RoadmapPlace, is_at
 from .roadmap import Ahead, Chain, Roadmap
 
@@ -48,13 +48,13 @@ ELSEWHERE = (0.15, -0.15)  # shifts of the place, over that length, if there is 
 GAIN = 0.998  # largest ratio of durations that counts as a gain
 INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-AGREES = 1 + 1e-4  # ratio of a plan of printed phases to those of the links, above which another
+AGREES = 1 + 1e-4  # ratio of a plan of printed phases to those of the edges, above which another
 # initial guess is tried
 TRIED = 6  # most routes without a plan, beyond those asked for
-OTHERS = 2  # most slower plans of a link that are tried if the fastest fails the replay
+OTHERS = 2  # most slower plans of an edge that are tried if the fastest fails the replay
 BEYOND = 1.1  # largest estimate of a route over that of the best one
 NEARBY = 30  # most places of `find_first`
-MEASURED, MORE = 24, 8  # most links planned until there is a route, and after it
+MEASURED, MORE = 24, 8  # most edges planned until there is a route, and after it
 SETTLED = 240  # most places that are settled to bound routes from below
 T = TypeVar("T")
 
@@ -78,30 +78,30 @@ behind 100 places in goal 26; looking that far takes goal 5 three times as long,
 
 
 @dataclass(frozen=True, eq=False)
-class RoadmapRoute:
-    """Links one after the other."""
+class Route:
+    """Edges one after the other."""
 
-    links: tuple[Link, ...]
+    edges: tuple[Edge, ...]
 
     @property
-    def duration(self) -> float:
+    def estimate(self) -> float:
         """Estimated duration [s]."""
-        return sum(link.duration for link in self.links)
+        return sum(edge.estimate for edge in self.edges)
 
     @property
     def in_cells(self) -> bool:
         """Whether it leads through cells, for which there is no lower bound."""
-        return any(link.in_cell for link in self.links)
+        return any(edge.in_cell for edge in self.edges)
 
     @property
     def signature(self) -> tuple[object, ...]:
         """Names of the contacts of each phase."""
-        return tuple(part for link in self.links for part in link.signature)
+        return tuple(part for edge in self.edges for part in edge.signature)
 
     @property
     def key(self) -> object:
         """Its formations, and how phases end."""
-        return self.signature, tuple(step.end for link in self.links for step in link.steps)
+        return self.signature, tuple(step.end for edge in self.edges for step in edge.steps)
 
 
 @dataclass(eq=False)
@@ -111,38 +111,38 @@ class RouteSearch:
     roadmap: Roadmap
     start: RoadmapPlace
     goal: Goal
-    # blocked links, as they are met
+    # blocked edges, as they are met
     blocked: list[Blocked] = field(default_factory=list)
     # the first route to each expanded place, by its key
-    reached: dict[Key, RoadmapRoute] = field(default_factory=dict)
+    reached: dict[Key, Route] = field(default_factory=dict)
     found: set[object] = field(default_factory=set)  # keys of routes that have been found
     limit: float = math.inf  # largest cost of routes [s]
-    sources: Sequence[RoadmapRoute] = ()  # routes to start with, if not from the start itself
+    sources: Sequence[Route] = ()  # routes to start with, if not from the start itself
 
     def measure(self, place: RoadmapPlace, turning: float = 1.0) -> float:
         """Heuristic time to turn from a place to the goal [s]; `turning` is that of a radian."""
         phi, scene = float(place.z[2]), self.roadmap.scene
         return turning * scene.scales.time * abs(self.goal.find_angle(scene, phi) - phi)
 
-    def run(self, rule: SearchRule = EAGER) -> Iterator[RoadmapRoute]:
+    def run(self, rule: SearchRule = EAGER) -> Iterator[Route]:
         """Yield new routes, about in the order of their durations."""
         time = self.roadmap.scene.scales.time
         number, times = count(), Counter[object]()
-        queue = list[tuple[float, int, RoadmapRoute, Chain | Expand | None]]()
+        queue = list[tuple[float, int, Route, Chain | Expand | None]]()
 
-        def stop_of(route: RoadmapRoute) -> RoadmapPlace:
-            return route.links[-1].stop if route.links else self.start
+        def stop_of(route: Route) -> RoadmapPlace:
+            return route.edges[-1].stop if route.edges else self.start
 
-        def put(route: RoadmapRoute, work: Chain | Expand | None, more: float = 0.0) -> None:
-            least = route.duration + self.measure(stop_of(route), rule.turning) + more
+        def put(route: Route, work: Chain | Expand | None, more: float = 0.0) -> None:
+            least = route.estimate + self.measure(stop_of(route), rule.turning) + more
             heapq.heappush(queue, (least, next(number), route, work))
 
-        def put_along(before: tuple[Link, ...], ahead: Ahead) -> None:
-            chain, link, whole = ahead
-            assert isinstance(link, Link)
-            put(RoadmapRoute((*before, link)), chain if whole else None)
+        def put_along(before: tuple[Edge, ...], ahead: Ahead) -> None:
+            chain, edge, whole = ahead
+            assert isinstance(edge, Edge)
+            put(Route((*before, edge)), chain if whole else None)
 
-        for source in self.sources or (RoadmapRoute(()),):
+        for source in self.sources or (Route(()),):
             put(source, None)
         for _ in range(MOST):
             if not queue:
@@ -153,18 +153,18 @@ class RouteSearch:
             if cost > self.limit or len(times) > rule.most:
                 return
             if callable(work):
-                links = work()
-                for link in (*links, *self.roadmap.land_at(links, self.goal)):
-                    put(RoadmapRoute((*route.links, link)), None)
+                edges = work()
+                for edge in (*edges, *self.roadmap.land_at(edges, self.goal)):
+                    put(Route((*route.edges, edge)), None)
                 continue
-            if route.links and is_at(place, self.goal):
+            if route.edges and is_at(place, self.goal):
                 if route.key not in self.found:
                     self.found.add(route.key)
                     yield route
                 continue
             if work is not None:
                 for ahead in self.roadmap.go_on(work, self.goal):
-                    put_along(route.links[:-1], ahead)
+                    put_along(route.edges[:-1], ahead)
             key = place.key
             if times[key] >= (1 if place.landed else OFTEN):
                 continue
@@ -173,8 +173,8 @@ class RouteSearch:
             for ahead in list(self.roadmap.set_out(place, self.goal)):
                 if self._is_back(route, ahead[0]):
                     continue
-                if isinstance(ahead[1], Link):
-                    put_along(route.links, ahead)
+                if isinstance(ahead[1], Edge):
+                    put_along(route.edges, ahead)
                 elif times[key] == 1 and ahead[1] not in self.blocked:
                     self.blocked.append(ahead[1])
             if not place.landed:
@@ -187,20 +187,20 @@ class RouteSearch:
                 put(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
 
     @staticmethod
-    def _is_back(route: RoadmapRoute, chain: Chain) -> bool:
+    def _is_back(route: Route, chain: Chain) -> bool:
         """Whether a chain begins with the border that a route has just followed."""
-        if not route.links or route.links[-1].in_cell:
+        if not route.edges or route.edges[-1].in_cell:
             return False
-        last = route.links[-1].steps[-1].contacts
+        last = route.edges[-1].steps[-1].contacts
         return set(last) == set(chain.borders[0].formation.contacts)
 
 
-Found = Measured | str
-Expand = Callable[[], list[Link]]
+Found = CoarsePlan | str
+Expand = Callable[[], list[Edge]]
 
 
 class RefinedPath(NamedTuple):
-    """Where a link leaves its border, and the guess of its path through the cell."""
+    """Where an edge leaves its border, and the guess of its path through the cell."""
 
     move: int | None  # shift of the place in finest steps; None: the border is left in motion
     straight: bool = True  # guess: straight through the cell, or to the nearest end of the phase
@@ -208,20 +208,20 @@ class RefinedPath(NamedTuple):
 
 @dataclass
 class ReleaseSearch:
-    """Pattern search for the place where a link leaves a border for a cell.
+    """Pattern search for the place where an edge leaves a border for a cell.
 
-    Least time of the link and of a border that follows where it lands.
+    Least time of the edge and of a border that follows where it lands.
     """
 
     plan: Callable[[RefinedPath], Found]
-    best: Measured
+    best: CoarsePlan
     to_go: CostToGo | None = None  # time of what follows [s]
     known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
     _tried: set[RefinedPath] = field(default_factory=set)
-    _others: list[Measured] = field(default_factory=list)
+    _others: list[CoarsePlan] = field(default_factory=list)
     _least: float = math.inf  # time of the best plan and of what follows [s]
 
-    def run(self) -> list[Measured]:
+    def run(self) -> list[CoarsePlan]:
         """The fastest plan, followed by the others."""
         self._least = time_with(self.to_go, self.best)
         # The same place again where another end may lead on faster.
@@ -261,22 +261,22 @@ class ReleaseSearch:
 
 
 @dataclass(eq=False)
-class Chooser:
+class RoutePlanner:
     """Routes of a search, and plans of those that seem best."""
 
     problem: Problem
-    before: list[RoadmapRoute]  # routes to the goals before
+    before: list[Route]  # routes to the goals before
     search: RouteSearch
     options: PlanOptions
     jobs: int = 1  # most processes at the same time
-    first_only: bool = False  # whether any plan will do: then links are not refined
-    found: list[RoadmapRoute] = field(default_factory=list)  # their links through cells have plans
-    made: list[tuple[Plan, RoadmapRoute]] = field(default_factory=list)
+    first_only: bool = False  # whether any plan will do: then edges are not refined
+    found: list[Route] = field(default_factory=list)  # their edges through cells have plans
+    made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
-    _prefetched: dict[Link, Found] = field(default_factory=dict)
+    _prefetched: dict[Edge, Found] = field(default_factory=dict)
     _measurements: int = 0
     _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
-    _lost: list[tuple[Link, ...]] = field(default_factory=list)
+    _lost: list[tuple[Edge, ...]] = field(default_factory=list)
 
     @property
     def roadmap(self) -> Roadmap:
@@ -297,8 +297,8 @@ class Chooser:
             # A route without a plan bounds nothing.
             self.search.limit = math.inf
 
-    def find_first(self, report: Callable[[str], None], most: int = NEARBY) -> RoadmapRoute | None:
-        """The first route over few places whose links through cells have plans."""
+    def find_first(self, report: Callable[[str], None], most: int = NEARBY) -> Route | None:
+        """The first route over few places whose edges through cells have plans."""
         self._look_by(EAGER._replace(most=most), 1, report)
         return self.found[0] if self.found else None
 
@@ -312,7 +312,7 @@ class Chooser:
                 continue
             if not self.first_only:
                 self._refine(route, report)
-            report(f"planning a route of {sum(len(link.steps) for link in route.links)} phases")
+            report(f"planning a route of {sum(len(edge.steps) for edge in route.edges)} phases")
             plan = self._plan(route, report)
             if isinstance(plan, str) and self._take_others(route):
                 plan = self._plan(route, report)
@@ -321,51 +321,51 @@ class Chooser:
             if isinstance(plan, str):
                 self.failures.append(plan)
                 if isinstance(plan, Lost):
-                    self._lost.append(plan.links)
+                    self._lost.append(plan.edges)
             else:
                 self.made.append((plan, route))
 
-    def _take_others(self, route: RoadmapRoute) -> bool:
-        """Take the other plans of links that last least by themselves; whether there are any.
+    def _take_others(self, route: Route) -> bool:
+        """Take the other plans of edges that last least by themselves; whether there are any.
 
         The plan of goal 32 of the corpus does not hold in its replay otherwise.
         """
-        plans = self.roadmap.measured
-        several = [link for link in route.links if len(plans.get(link, ())) > 1]
-        plans.update({link: plans[link][1:2] for link in several})
+        plans = self.roadmap.coarse_plans
+        several = [edge for edge in route.edges if len(plans.get(edge, ())) > 1]
+        plans.update({edge: plans[edge][1:2] for edge in several})
         return bool(several)
 
-    def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
+    def _plan(self, route: Route, report: Callable[[str], None]) -> Plan | str:
         """The plan of the phases that are printed for a route.
 
-        Their ends are those of plans of the route's links. These are the initial guess, too, if
+        Their ends are those of plans of the route's edges. These are the initial guess, too, if
         they have the torques and the objective of the plan; for another objective if there is no
         plan without (query 19, margin).
         """
         problem, options, scene = self.problem, self.options, self.problem.scene
-        # Plans of links are of least time, with torques that are free to jump.
+        # Plans of edges are of least time, with torques that are free to jump.
         slow = scene.has_slow_motors or scene.control_period > 0
         alike = options.goal is Objective.TIME and not slow
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
-        every = [link for r in (*self.before, route) for link in r.links]
-        links = [(link, self.roadmap.measured.get(link, [])[: 1 + OTHERS]) for link in every]
+        every = [edge for r in (*self.before, route) for edge in r.edges]
+        edges = [(edge, self.roadmap.coarse_plans.get(edge, [])[: 1 + OTHERS]) for edge in every]
         if problem is not self.problem:
             # Their guesses are of other motors.
-            links = [(link, [m._replace(begun=[]) for m in plans]) for link, plans in links]
+            edges = [(edge, [m._replace(begun=[]) for m in plans]) for edge, plans in edges]
         background = None
         if self.jobs > 1 and not self.before and self._bound is None:
             # A bound up to more than the plan will take, computed beside it.
             enough = BEYOND * self.estimate(route)
             background = BackgroundTask(partial(bound_borders, self.search, enough))
             self._bound = enough, background
-        planned = plan_links(
-            problem, links, options, self.roadmap.joined, report, self.jobs, background
+        planned = plan_edges(
+            problem, edges, options, self.roadmap.joined, report, self.jobs, background
         )
         if isinstance(planned, Lost):
             return planned
-        reached = sum(link.duration for link in planned)
+        reached = sum(edge.duration for edge in planned)
         best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
@@ -408,79 +408,79 @@ class Chooser:
         """About the least time of a route that is found [s]."""
         return min((self.estimate(route) for route in self.found), default=float("inf"))
 
-    def _measure(self, route: RoadmapRoute, report: Callable[[str], None]) -> bool:
-        """Plan the links of a route that lead through cells; whether all have a plan."""
-        measured = self.roadmap.measured
+    def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
+        """Plan the edges of a route that lead through cells; whether all have a plan."""
+        measured = self.roadmap.coarse_plans
         if self._is_lost(route):
             return False
         kept = self._prefetched
         new = [
-            link
-            for link in route.links
-            if link.in_cell and link not in measured and link not in kept
+            edge
+            for edge in route.edges
+            if edge.in_cell and edge not in measured and edge not in kept
         ]
         if self.jobs > 1 and len(new) > 1:
-            plans = self._share([partial(self._measure_link, link) for link in new])
+            plans = self._share([partial(self._plan_coarsely, edge) for edge in new])
             kept.update(zip(new, plans, strict=True))
-        for link in route.links:
-            if not link.in_cell:
+        for edge in route.edges:
+            if not edge.in_cell:
                 continue
-            if link not in measured:
+            if edge not in measured:
                 self._measurements += 1
-                report(f"planning {describe_steps(link.steps)}")
-                plan = kept.pop(link) if link in kept else self._measure_link(link)
-                measured[link] = [] if isinstance(plan, str) else [plan]
-            if not measured[link]:
+                report(f"planning {describe_steps(edge.steps)}")
+                plan = kept.pop(edge) if edge in kept else self._plan_coarsely(edge)
+                measured[edge] = [] if isinstance(plan, str) else [plan]
+            if not measured[edge]:
                 return False
         return True
 
-    def _refine(self, route: RoadmapRoute, report: Callable[[str], None]) -> None:
+    def _refine(self, route: Route, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
         roadmap = self.roadmap
-        links = list[Link]()
+        edges = list[Edge]()
         searches = list[ReleaseSearch]()
-        for link, after in pairwise((*route.links, None)):
-            if link is None or link.left is None or link in roadmap.refined:
+        for edge, after in pairwise((*route.edges, None)):
+            if edge is None or edge.left is None or edge in roadmap.refined:
                 continue
-            report(f"planning {describe_steps(link.steps)} in other ways")
+            report(f"planning {describe_steps(edge.steps)} in other ways")
             single = after and not after.in_cell and len(after.steps) == 1
-            to_go = look_ahead(self.problem, after, link.stop) if after and single else None
-            (plan,) = roadmap.measured[link]
-            searches.append(ReleaseSearch(partial(self._release, link, to_go), plan, to_go))
-            links.append(link)
-        roadmap.refined.update(links)
+            to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
+            (plan,) = roadmap.coarse_plans[edge]
+            searches.append(ReleaseSearch(partial(self._release, edge, to_go), plan, to_go))
+            edges.append(edge)
+        roadmap.refined.update(edges)
         if self.jobs > 1 and len(searches) == 1:
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
             first = self._share([partial(searches[0].plan, path) for path in paths])
             searches[0].known = dict(zip(paths, first, strict=True))
         results = self._share([search.run for search in searches])
-        for link, (best, *others) in zip(links, results, strict=True):
-            roadmap.measured[link] = [best, *sorted(others, key=lambda plan: plan.duration)]
+        for edge, (best, *others) in zip(edges, results, strict=True):
+            roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
     def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene))
 
-    def _measure_link(self, link: Link) -> Found:
-        """Plan a link through a cell, from other places of its border if that fails."""
-        plan = measure_link(self.problem, link, link.steps, self.options, further=True)
-        for move in ELSEWHERE if link.left else ():
-            place = link.share + move
+    def _plan_coarsely(self, edge: Edge) -> Found:
+        """Plan an edge through a cell, from other places of its border if that fails."""
+        plan = plan_coarsely(self.problem, edge, edge.steps, self.options, further=True)
+        for move in ELSEWHERE if edge.left else ():
+            place = edge.share + move
             if not isinstance(plan, str):
                 break
             if INSIDE < place < 1 - INSIDE:
-                plan = measure_link(self.problem, link, leave_at(link, place), self.options)
+                plan = plan_coarsely(self.problem, edge, leave_at(edge, place), self.options)
         return plan
 
-    def _release(self, link: Link, to_go: CostToGo | None, path: RefinedPath) -> Found:
-        """Plan a link that leaves its border at another place, or in motion."""
-        place = None if path.move is None else link.share + FINEST * path.move
+    def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> Found:
+        """Plan an edge that leaves its border at another place, or in motion."""
+        place = None if path.move is None else edge.share + FINEST * path.move
         if place is not None and not INSIDE < place < 1 - INSIDE:
             return "it is too near to the end of the border"
-        steps = leave_at(link, place)
+        steps = leave_at(edge, place)
         # In motion the first guess has no plan in goal 48 of the corpus.
-        return measure_link(
+        return plan_coarsely(
             self.problem,
-            link,
+            edge,
             steps,
             self.options,
             straight=path.straight,
@@ -488,22 +488,22 @@ class Chooser:
             to_go=to_go,
         )
 
-    def _is_lost(self, route: RoadmapRoute) -> bool:
-        """Whether a route contains links that had no plan on another one."""
+    def _is_lost(self, route: Route) -> bool:
+        """Whether a route contains edges that had no plan on another one."""
         return any(
-            route.links[k : k + len(lost)] == lost
+            route.edges[k : k + len(lost)] == lost
             for lost in self._lost
-            for k in range(len(route.links))
+            for k in range(len(route.edges))
         )
 
-    def estimate(self, route: RoadmapRoute) -> float:
+    def estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
-        for link in (link for r in (*self.before, route) for link in r.links):
-            if plans := self.roadmap.measured.get(link):
+        for edge in (edge for r in (*self.before, route) for edge in r.edges):
+            if plans := self.roadmap.coarse_plans.get(edge):
                 total += plans[0].duration
             else:
-                total += FASTER * link.duration if link.in_cell else link.duration
+                total += FASTER * edge.estimate if edge.in_cell else edge.estimate
         return total
 
 
@@ -526,21 +526,21 @@ class BorderBound(NamedTuple):
 def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
     """Bound every route along borders from below, up to `enough` [s].
 
-    Dijkstra's algorithm with coarse bounds of links; those of the shortest route are refined until
-    all of its links are.
+    Dijkstra's algorithm with coarse bounds of edges; those of the shortest route are refined until
+    all of its edges are.
     """
-    refined, links_from = set[Link](), dict[Key, list[Link]]()
+    refined, edges_from = set[Edge](), dict[Key, list[Edge]]()
     while True:
-        order, settled, links = count(), set[Key](), tuple[Link, ...]()
+        order, settled, edges = count(), set[Key](), tuple[Edge, ...]()
         bound = BorderBound(enough, True)
-        queue = [(0.0, next(order), search.start, links)]
+        queue = [(0.0, next(order), search.start, edges)]
         while queue:
             beat()
             cost, _, place, route = heapq.heappop(queue)
             if cost >= enough:
                 break
             if is_at(place, search.goal):
-                bound, links = BorderBound(cost, True), route
+                bound, edges = BorderBound(cost, True), route
                 break
             if place.key in settled:
                 continue
@@ -548,12 +548,12 @@ def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
                 bound = BorderBound(cost, False)
                 break
             settled.add(place.key)
-            if place.key not in links_from:
+            if place.key not in edges_from:
                 every = search.roadmap.list_along(place, search.goal)
-                links_from[place.key] = [link for _, link, _ in every if isinstance(link, Link)]
-            for link in links_from[place.key]:
-                least = link.fine_bound if link in refined else ROUGHLY * link.bound
-                heapq.heappush(queue, (cost + least, next(order), link.stop, (*route, link)))
-        if refined.issuperset(links):
+                edges_from[place.key] = [edge for _, edge, _ in every if isinstance(edge, Edge)]
+            for edge in edges_from[place.key]:
+                least = edge.fine_bound if edge in refined else ROUGHLY * edge.bound
+                heapq.heappush(queue, (cost + least, next(order), edge.stop, (*route, edge)))
+        if refined.issuperset(edges):
             return bound
-        refined.update(links)
+        refined.update(edges)

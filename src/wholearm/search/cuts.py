@@ -27,16 +27,16 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Goal, Phase, Problem
 from ..scene.model import Scene
-from .astar import EAGER, NEARBY, Chooser, RoadmapRoute, RouteSearch
+from .astar import EAGER, NEARBY, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
 from .edges import (
     DEPENDENT,
     Blocked,
     BorderEdge,
-    Link,
+    Edge,
     cut_curve,
     describe_steps,
-    link_along,
+    edge_along,
     point_out,
 )
 from .places import make_place, measure_along, require_reach
@@ -105,7 +105,7 @@ def list_cut_borders(search: RouteSearch) -> list[CutBorder]:
     for blocked in list_cut(search):
         for chain in search.roadmap.follow(blocked.start):
             border = chain.borders[0]
-            if chain.link is blocked:
+            if chain.edge is blocked:
                 borders.append(CutBorder(blocked, border))
                 break
             if set(border.formation.contacts) == set(blocked.steps[-1].contacts):
@@ -129,7 +129,7 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
             tried = number.value, 0.0 if friction else number.value * FARTHEST**number.sign
 
             def opens(number: Parameter, value: float, cut: CutBorder = cut) -> bool:
-                return isinstance(link_changed(cut, Change(number, value)), Link)
+                return isinstance(edge_changed(cut, Change(number, value)), Edge)
 
             for change in find_changes([number], {number: tried}.__getitem__, opens):
                 _, values = by_key.setdefault(number.key, (number, [math.nan] * len(cuts)))
@@ -143,15 +143,15 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
     return sorted(openings, key=rank)
 
 
-def link_changed(cut: CutBorder, change: Change) -> Link | Blocked:
-    """The link along a border of the changed problem, or why no motion follows it."""
+def edge_changed(cut: CutBorder, change: Change) -> Edge | Blocked:
+    """The edge along a border of the changed problem, or why no motion follows it."""
     blocked, border, key = cut.blocked, cut.border, change.parameter.key
     if key == EPSILON:
         border = replace(border, terms=border.terms._replace(epsilon=change.value))
     else:
         border = replace(border, curve=change_curve(border.curve, key, change.value))
     stop = replace(blocked.stop, scene=border.formation.scene)
-    return link_along((border,), (1.0,), blocked.steps, stop)
+    return edge_along((border,), (1.0,), blocked.steps, stop)
 
 
 def find_opening(
@@ -182,17 +182,17 @@ def find_opening(
             changed = problem.with_(change.values)
         except InputError:
             return None
-        lasts, sources = dict[int, Link](), list[RoadmapRoute]()
+        lasts, sources = dict[int, Edge](), list[Route]()
         for k in beyond:
             before = search.reached.get(cuts[k].blocked.start.key)
-            link = link_changed(cuts[k], change)
-            if before is not None and isinstance(link, Link):
-                lasts[k] = link
-                sources.append(RoadmapRoute((*before.links, link)))
+            edge = edge_changed(cuts[k], change)
+            if before is not None and isinstance(edge, Edge):
+                lasts[k] = edge
+                sources.append(Route((*before.edges, edge)))
         if not sources:
             return None
         result = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
-        return result and (result[1], [k for k, link in lasts.items() if link in result[0].links])
+        return result and (result[1], [k for k, edge in lasts.items() if edge in result[0].edges])
 
     for opening in list_openings(cuts)[:TRIED]:
         most = opening.open_all()
@@ -220,26 +220,26 @@ def _search_changed(
     goal: Goal,
     options: PlanOptions,
     planned: bool,
-    sources: Sequence[RoadmapRoute] = (),
+    sources: Sequence[Route] = (),
     most: int = NEARBY,
-) -> tuple[RoadmapRoute, float] | None:
+) -> tuple[Route, float] | None:
     """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
     changed = replace(changed, start=z)
     roadmap = Roadmap(changed, options.uniqueness_margin)
     search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
-    chooser = Chooser(changed, [], search, rough, first_only=True)
+    planner = RoutePlanner(changed, [], search, rough, first_only=True)
     try:
-        route = chooser.find_first(lambda _: None, most)
+        route = planner.find_first(lambda _: None, most)
         if route is None:
             return None
         if not planned:
-            return route, route.duration
-        chooser.plan(1, lambda _: None)
+            return route, route.estimate
+        planner.plan(1, lambda _: None)
     except np.linalg.LinAlgError:
         return None
-    return (chooser.made[0][1], chooser.made[0][0].duration) if chooser.made else None
+    return (planner.made[0][1], planner.made[0][0].duration) if planner.made else None
 
 
 def find_hand(

@@ -1,8 +1,8 @@
-"""Plans of the links of routes, each from rest to rest, and of the phases that are printed.
+"""Plans of the edges of routes, each from rest to rest, and of the phases that are printed.
 
-Links through cells are first planned alone, on few intervals, for their times and initial guesses.
-The plan of a link depends on the others only by the configurations at its ends. Where a link
-through a cell lands on a border is optimized together with the first phase of the next link.
+Edges through cells are first planned alone, on few intervals, for their times and initial guesses.
+The plan of an edge depends on the others only by the configurations at its ends. Where an edge
+through a cell lands on a border is optimized together with the first phase of the next edge.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import CostToGo, split_blocks, trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
-from ..planning.blocks import BlockPlan, Planning, plan_next
+from ..planning.blocks import BlockPlan, Planning, estimate_time_to_go, plan_next
 from ..planning.explain import unadvised
 from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
@@ -42,8 +42,8 @@ from ..scene.model import Scene
 from .edges import (
     DEPENDENT,
     INTERVALS,
+    Edge,
     EdgeStep,
-    Link,
     describe_steps,
     find_headings,
     point_out,
@@ -63,8 +63,8 @@ Key = tuple[object, ...]
 T = TypeVar("T")
 
 
-class Measured(NamedTuple):
-    """The plan of one link through a cell."""
+class CoarsePlan(NamedTuple):
+    """The plan of one edge through a cell."""
 
     duration: float  # [s]
     steps: tuple[EdgeStep, ...]  # its phases as planned
@@ -80,21 +80,21 @@ def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
     ]
 
 
-def measure_link(
+def plan_coarsely(
     problem: Problem,
-    link: Link,
+    edge: Edge,
     steps: tuple[EdgeStep, ...],
     options: PlanOptions,
     further: bool = False,
     straight: bool = True,
     first_only: bool = False,
     to_go: CostToGo | None = None,
-) -> Measured | str:
-    """Plan a link through a cell alone, on few intervals; the plan, or why there is none.
+) -> CoarsePlan | str:
+    """Plan an edge through a cell alone, on few intervals; the plan, or why there is none.
 
     Parameters
     ----------
-    steps       the link's, or others between the same places
+    steps       the edge's, or others between the same places
     further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried
@@ -103,16 +103,16 @@ def measure_link(
     from ..planning.time_domain.time_plan import try_phases
 
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH)
-    phases, z, spent = make_phases(problem, steps), link.start.z, 0.0
+    phases, z, spent = make_phases(problem, steps), edge.start.z, 0.0
     try:
         single = replace(problem, goals=(), phases=tuple(phases))
         if len(phases) > 1 and phases[0].end is End.REST:
             curve = trace_phase(phases[0], z)
             spent = look_along((curve,), problem.epsilon, INTERVALS)
             z, phases = curve.end, phases[1:]
-        goal = close_place(link.stop) if len(phases) == 1 else None
+        goal = close_place(edge.stop) if len(phases) == 1 else None
         if goal is None:
-            goal = replace(link.stop, z=find_end(phases[0], z, phases[1:]))
+            goal = replace(edge.stop, z=find_end(phases[0], z, phases[1:]))
         moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
         if moved < (STILL * problem.scene.scales.length) ** 2:
             return f"{phases[0].until} holds already where it starts"
@@ -127,14 +127,14 @@ def measure_link(
         return DEPENDENT
     if plans is None:
         return "no guess leads to a plan"
-    return Measured(spent + sum(plan.motion.duration for plan in plans), steps, plans)
+    return CoarsePlan(spent + sum(plan.motion.duration for plan in plans), steps, plans)
 
 
 class Lost(str):
-    """Why a route has no plan, with the links for which that is so on every route."""
+    """Why a route has no plan, with the edges for which that is so on every route."""
 
     # the one whose planning fails, after the one that lands at its start, if any
-    links: tuple[Link, ...] = ()
+    edges: tuple[Edge, ...] = ()
 
 
 def plan_phases(
@@ -157,15 +157,15 @@ def plan_phases(
     return cache[key]
 
 
-def list_printed(scene: Scene, links: Sequence[PlannedLink], guesses: bool) -> tuple[Phase, ...]:
-    """The phases of planned links as they are printed and read again.
+def list_printed(scene: Scene, edges: Sequence[PlannedEdge], guesses: bool) -> tuple[Phase, ...]:
+    """The phases of planned edges as they are printed and read again.
 
     With `guesses` phases over time begin with the modes and poses of their plans, rounded.
     """
     phases = list[Phase]()
-    for link in links:
-        plans = (plan for block in link.blocks for plan in block.plans)
-        for phase, plan in zip(link.phases, plans, strict=True):
+    for edge in edges:
+        plans = (plan for block in edge.blocks for plan in block.plans)
+        for phase, plan in zip(edge.phases, plans, strict=True):
             if guesses and isinstance(plan.motion, TimeMotion):
                 phase = replace(phase, guess=_list_modes(plan.motion, scene.scales.length))
             phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED_ANGLE)))
@@ -193,9 +193,9 @@ def _round(value: float, unit: float) -> float:
     return round(value, math.ceil(-math.log10(unit)))
 
 
-Links = Sequence[tuple[Link, Sequence[Measured]]]
-"""Links of a route, each with the plans of it that are known, the fastest first."""
-Chosen = tuple[Link, Measured | None]  # a link, and a plan of it as initial guess
+Edges = Sequence[tuple[Edge, Sequence[CoarsePlan]]]
+"""Edges of a route, each with the plans of it that are known, the fastest first."""
+Chosen = tuple[Edge, CoarsePlan | None]  # an edge, and a plan of it as initial guess
 
 
 @dataclass
@@ -207,52 +207,52 @@ class BackgroundTask(Generic[T]):
 
 
 @exclusive
-def plan_links(
+def plan_edges(
     problem: Problem,
-    links: Links,
+    edges: Edges,
     options: PlanOptions,
     cache: Cache,
     report: Callable[[str], None],
     jobs: int = 1,
     background: BackgroundTask[Any] | None = None,
-) -> list[PlannedLink] | Lost:
-    """Plans of the links of a route, or why there are none.
+) -> list[PlannedEdge] | Lost:
+    """Plans of the edges of a route, or why there are none.
 
     Parameters
     ----------
-    links       one after the other from the problem's start. Where a guess of a link has no plan,
+    edges       one after the other from the problem's start. Where a guess of an edge has no plan,
                 or nothing leads on from where it lands, the next one is tried, and at last none,
-                with regard to the link after it.
-    cache       plans of links that were made before, to which others are added
-    jobs        most processes that plan links at the same time
+                with regard to the edge after it.
+    cache       plans of edges that were made before, to which others are added
+    jobs        most processes that plan edges at the same time
     background  a task for one of these processes
     """
-    planner = _LinkPlanner(problem, options.scale_ranges(problem.ranges), cache, report)
-    guesses = [[*measured, None] for _, measured in links]
+    planner = _EdgePlanner(problem, options.scale_ranges(problem.ranges), cache, report)
+    guesses = [[*measured, None] for _, measured in edges]
     with unadvised():
         while True:
-            chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
+            chosen = [(edge, plans[0]) for (edge, _), plans in zip(edges, guesses, strict=True)]
             if jobs > 1:
                 planner.plan_parallel(chosen, jobs, background)
                 jobs = 1
             planned, reason = planner.plan(chosen)
             if not reason:
                 return planned
-            # The link that lands where the culprit starts may have landed at another place.
+            # The edge that lands where the culprit starts may have landed at another place.
             first = len(planned)
-            first -= first > 0 and links[first - 1][0].in_cell
+            first -= first > 0 and edges[first - 1][0].in_cell
             blamed = range(len(planned), first - 1, -1)
             other = next((k for k in blamed if len(guesses[k]) > 1), None)
             if other is None:
                 lost = Lost(reason)
-                lost.links = tuple(link for link, _ in links[first : len(planned) + 1])
+                lost.edges = tuple(edge for edge, _ in edges[first : len(planned) + 1])
                 return lost
             guesses[other].pop(0)
 
 
 @dataclass(frozen=True, eq=False)
-class _LinkPlanner:
-    """Plans the links of a route, and keeps their plans in a cache."""
+class _EdgePlanner:
+    """Plans the edges of a route, and keeps their plans in a cache."""
 
     problem: Problem
     options: PlanOptions
@@ -260,17 +260,17 @@ class _LinkPlanner:
     report: Callable[[str], None]
 
     def plan_parallel(
-        self, links: Sequence[Chosen], jobs: int, background: BackgroundTask[Any] | None
+        self, edges: Sequence[Chosen], jobs: int, background: BackgroundTask[Any] | None
     ) -> None:
-        """Plan links in parallel: each part begins with a link whose start is known."""
-        starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
-        parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
+        """Plan edges in parallel: each part begins with an edge whose start is known."""
+        starts = [0, *(k + 1 for k, (edge, _) in enumerate(edges[:-1]) if not edge.in_cell)]
+        parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(edges)], strict=True)]
         # The longest tasks first.
-        cells = [part for part in parts if any(links[k][0].in_cell for k in part)]
+        cells = [part for part in parts if any(edges[k][0].in_cell for k in part)]
         parts = [*cells, *(part for part in parts if part not in cells)]
-        self.report(f"planning {len(links)} parts of the route")
+        self.report(f"planning {len(edges)} parts of the route")
         quiet = replace(self, report=lambda _: None)
-        tasks: list[Task[Any]] = [partial(quiet._plan_part, links, part) for part in parts]
+        tasks: list[Task[Any]] = [partial(quiet._plan_part, edges, part) for part in parts]
         if background:
             tasks.insert(len(cells), background.task)
         results = share(tasks, jobs, (self.problem, self.problem.scene))
@@ -280,64 +280,64 @@ class _LinkPlanner:
             self.cache.update(plans)
 
     def _plan_part(
-        self, links: Sequence[Chosen], part: Sequence[int]
-    ) -> dict[Key, PlannedLink | str]:
-        """New entries of the cache after planning some links one after the other."""
+        self, edges: Sequence[Chosen], part: Sequence[int]
+    ) -> dict[Key, PlannedEdge | str]:
+        """New entries of the cache after planning some edges one after the other."""
         # Each plan is stored at once, so that an interrupt loses none.
         before = set(self.cache)
-        z = links[part[0]][0].start.z if part[0] else self.problem.start
+        z = edges[part[0]][0].start.z if part[0] else self.problem.start
         for k in part:
-            planned = self._plan_cached(links, k, z)
+            planned = self._plan_cached(edges, k, z)
             if isinstance(planned, str):
                 break
             z = planned.end
         return {key: self.cache[key] for key in set(self.cache) - before}
 
-    def plan(self, links: Sequence[Chosen]) -> tuple[list[PlannedLink], str]:
-        """Plans of links one after the other, and why the next one has none, if so."""
-        z, plans = self.problem.start, list[PlannedLink]()
-        for k, (link, _) in enumerate(links):
-            apart = measure_apart(self.problem.scene, z, link.start.z)
-            if k and not links[k - 1][0].in_cell and apart < MET:
-                z = link.start.z  # A border ends at the same place from wherever it starts.
-            planned = self._plan_cached(links, k, z)
+    def plan(self, edges: Sequence[Chosen]) -> tuple[list[PlannedEdge], str]:
+        """Plans of edges one after the other, and why the next one has none, if so."""
+        z, plans = self.problem.start, list[PlannedEdge]()
+        for k, (edge, _) in enumerate(edges):
+            apart = measure_apart(self.problem.scene, z, edge.start.z)
+            if k and not edges[k - 1][0].in_cell and apart < MET:
+                z = edge.start.z  # A border ends at the same place from wherever it starts.
+            planned = self._plan_cached(edges, k, z)
             if isinstance(planned, str):
-                return plans, f"{describe_steps(link.steps)}: {planned}"
+                return plans, f"{describe_steps(edge.steps)}: {planned}"
             plans.append(planned)
             z = planned.end
         return plans, ""
 
-    def _plan_cached(self, links: Sequence[Chosen], k: int, z: Array) -> PlannedLink | str:
-        """The plan of link number k from `z`, from the cache if it is there."""
-        link, guess = links[k]
-        following = links[k + 1][0] if k + 1 < len(links) else None
-        link = link if guess is None else replace(link, steps=guess.steps)
+    def _plan_cached(self, edges: Sequence[Chosen], k: int, z: Array) -> PlannedEdge | str:
+        """The plan of edge number k from `z`, from the cache if it is there."""
+        edge, guess = edges[k]
+        following = edges[k + 1][0] if k + 1 < len(edges) else None
+        edge = edge if guess is None else replace(edge, steps=guess.steps)
         # A landing is planned with the border that follows, as if that ended at rest.
-        lands = link.in_cell and following is not None and not following.in_cell
+        lands = edge.in_cell and following is not None and not following.in_cell
         follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
         length = self.problem.scene.scales.length
         place = tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
-        # Neither samples nor checks of whole plans matter to those of links.
+        # Neither samples nor checks of whole plans matter to those of edges.
         settings = repr(replace(self.options, samples=2, replay=False, certify=False))
-        key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
+        key = (place, key_steps(edge.steps), key_steps(follows), guess is None, settings)
         if key not in self.cache:
-            self.report(f"planning {describe_steps(link.steps)}")
+            self.report(f"planning {describe_steps(edge.steps)}")
             try:
-                self.cache[key] = self._plan_link(link, follows, guess, z)
+                self.cache[key] = self._plan_edge(edge, follows, guess, z)
             except WholearmError as error:
                 self.cache[key] = str(error)
             except np.linalg.LinAlgError:
                 self.cache[key] = DEPENDENT
         return self.cache[key]
 
-    def _plan_link(
-        self, link: Link, follows: Sequence[EdgeStep], measured: Measured | None, z: Array
-    ) -> PlannedLink:
-        """Plan a link and the phases that follow, of which only the link is kept."""
-        steps = (*link.steps, *follows)
+    def _plan_edge(
+        self, edge: Edge, follows: Sequence[EdgeStep], measured: CoarsePlan | None, z: Array
+    ) -> PlannedEdge:
+        """Plan an edge and the phases that follow, of which only the edge is kept."""
+        steps = (*edge.steps, *follows)
         phases, curves = make_phases(self.problem, steps), list[Curve]()
-        if not link.in_cell and len(phases) == 1:
-            phases[0], curve = _aim(phases[0], z, link)
+        if not edge.in_cell and len(phases) == 1:
+            phases[0], curve = _aim(phases[0], z, edge)
             curves.append(curve)
         single = replace(self.problem, start=z, phases=tuple(phases), goals=())
         count = len(phases) - len(follows)
@@ -356,14 +356,14 @@ class _LinkPlanner:
             pin_landing(phase, end_of(plan)[0])
             for phase, plan in zip(phases[:count], planning.plans, strict=True)
         ]
-        return PlannedLink(tuple(pinned), planning.blocks)
+        return PlannedEdge(tuple(pinned), planning.blocks)
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedLink:
-    """The plan of a link."""
+class PlannedEdge:
+    """The plan of an edge."""
 
-    phases: tuple[Phase, ...]  # counted from the first of the link
+    phases: tuple[Phase, ...]  # counted from the first of the edge
     blocks: tuple[BlockPlan, ...]
 
     @property
@@ -377,7 +377,7 @@ class PlannedLink:
         return sum(plan.motion.duration for block in self.blocks for plan in block.plans)
 
 
-Cache = MutableMapping[Key, PlannedLink | str]  # plans of links, or why there are none
+Cache = MutableMapping[Key, PlannedEdge | str]  # plans of edges, or why there are none
 
 
 def key_steps(steps: Sequence[EdgeStep]) -> Key:
@@ -400,42 +400,35 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     return replace(phase, until=replace(until, pins=((name, value),)))
 
 
-def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
-    """The phase of a border's link from `z` and its curve, which ends where the link does.
+def _aim(phase: Phase, z: Array, edge: Edge) -> tuple[Phase, Curve]:
+    """The phase of a border's edge from `z` and its curve, which ends where the edge does.
 
     A contact may be gained both ways along a border; then the end is given by x or phi.
     """
     try:
         curve = trace_phase(phase, z)
-        if measure_apart(link.stop.scene, curve.end, link.stop.z) <= OFF:
+        if measure_apart(edge.stop.scene, curve.end, edge.stop.z) <= OFF:
             return phase, curve
     except InputError:
         pass
-    other = replace(phase, until=point_out(phase.formation.contacts, link.stop.z))
+    other = replace(phase, until=point_out(phase.formation.contacts, edge.stop.z))
     return other, trace_phase(other, z)
 
 
-def look_ahead(problem: Problem, link: Link, place: RoadmapPlace) -> CostToGo | None:
-    """Least time [s] along a border's link of one phase, as a function of where it begins.
+def look_ahead(problem: Problem, edge: Edge, place: RoadmapPlace) -> CostToGo | None:
+    """Least time [s] along a border's edge of one phase, as a function of where it begins.
 
     It begins about at `place`; None if that is where the border ends.
     """
-    (phase,) = make_phases(problem, link.steps)
+    (phase,) = make_phases(problem, edge.steps)
     try:
-        phase, _ = _aim(phase, (close_place(place) or place).z, link)
+        phase, _ = _aim(phase, (close_place(place) or place).z, edge)
     except InputError:
         return None
-
-    def value(z: Array) -> float:
-        try:
-            return look_along((trace_phase(phase, z),), problem.epsilon, INTERVALS)
-        except NoMotionError:
-            raise SolverError("no motion keeps the limits along the border that follows") from None
-
-    return CostToGo(phase, value)
+    return estimate_time_to_go(phase, problem.epsilon)
 
 
-def time_with(to_go: CostToGo | None, plan: Measured) -> float:
+def time_with(to_go: CostToGo | None, plan: CoarsePlan) -> float:
     """Duration [s] of a plan through a cell and of what follows; infinite if nothing does."""
     try:
         return plan.duration + (to_go.value(end_of(plan.begun[-1])[0]) if to_go else 0.0)

@@ -1,4 +1,4 @@
-"""Links between places: phases along borders and through cells, with estimated durations."""
+"""Edges between places: phases along borders and through cells, with estimated durations."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class Terms(NamedTuple):
 
 
 class EdgeStep(NamedTuple):
-    """One phase of a link."""
+    """One phase of an edge."""
 
     contacts: tuple[Contact, ...]
     until: Until
@@ -164,14 +164,18 @@ class EdgeStep(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
-    """An edge of the roadmap: phases from rest at one place to rest at another."""
+class Edge:
+    """An edge of the roadmap: phases from rest at one place to rest at another.
+
+    `estimate` orders the search, `bound` is below every plan; `edge_plans` has its plans: a coarse
+    one through a cell (`plan_coarsely`), and the accurate ones of a route (`plan_edges`).
+    """
 
     start: RoadmapPlace
     stop: RoadmapPlace
     steps: tuple[EdgeStep, ...]
-    duration: float  # [s]: estimated
-    # whether it leads through a cell: then the planner optimizes its end, the duration is that of
+    estimate: float  # [s]: of its least time
+    # whether it leads through a cell: then the planner optimizes its end, the estimate is that of
     # straight paths, and the bound is zero
     in_cell: bool = False
     left: Curve | None = None  # the border that it leaves for the cell
@@ -204,7 +208,7 @@ class Link:
 
 
 class Blocked(NamedTuple):
-    """A link without a feasible motion."""
+    """An edge without a feasible motion."""
 
     start: RoadmapPlace
     steps: tuple[EdgeStep, ...]
@@ -323,18 +327,18 @@ def point_out(contacts: Sequence[Contact], z: Array) -> Until:
     return Until(coordinate="phi", value=float(z[2]))
 
 
-def leave_at(link: Link, share: float | None) -> tuple[EdgeStep, ...]:
-    """The phases of a link that leaves a border at a share of its length; with None in motion."""
-    first, *rest = link.steps
+def leave_at(edge: Edge, share: float | None) -> tuple[EdgeStep, ...]:
+    """The phases of an edge that leaves a border at a share of its length; with None in motion."""
+    first, *rest = edge.steps
     if share is None:
         return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
-    assert link.left is not None
-    z = link.left.evaluate(np.array([share * link.left.length])).z[0]
+    assert edge.left is not None
+    z = edge.left.evaluate(np.array([share * edge.left.length])).z[0]
     return (first._replace(until=point_out(first.contacts, z)), *rest)
 
 
 def describe_steps(steps: Sequence[EdgeStep]) -> str:
-    """Phases of a link in words."""
+    """Phases of an edge in words."""
     return ", then ".join(
         f"{' '.join(c.name for c in step.contacts)} until {step.until}" for step in steps
     )
@@ -368,13 +372,13 @@ def time_parts(border: BorderEdge, shares: Array) -> Array:
     return times
 
 
-def link_along(
+def edge_along(
     borders: tuple[BorderEdge, ...],
     ratios: tuple[float, ...],
     steps: tuple[EdgeStep, ...],
     stop: RoadmapPlace,
-) -> Link | Blocked:
-    """The link along borders without a stop between; motions can pass all but the last one.
+) -> Edge | Blocked:
+    """The edge along borders without a stop between; motions can pass all but the last one.
 
     With speed `ratios` the speed is continuous where two borders meet.
     """
@@ -389,5 +393,5 @@ def link_along(
         limits = [b.find_limits(intervals).with_speed_ratio(ratio) for b, ratio in pairs]
         duration = estimate_duration(limits)
         if not isinstance(duration, str):
-            return Link(start, stop, steps, duration, borders=borders, ratios=ratios)
+            return Edge(start, stop, steps, duration, borders=borders, ratios=ratios)
     return Blocked(start, steps, Unstopped(duration), stop)

@@ -32,7 +32,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
 from ..problem.table import SAME, describe_phase, describe_scene, write_toml
-from .astar import EAGER, BorderBound, Chooser, RoadmapRoute, RouteSearch
+from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edges import Blocked
 from .places import is_at, make_place, require_reach
@@ -117,9 +117,9 @@ def find_route_with(
             raise InputError(problem.source, "goal", reason)
         if cache is not None:
             require_folder(cache)
-        roadmap, before = get_roadmap(problem, options, cache), list[RoadmapRoute]()
+        roadmap, before = get_roadmap(problem, options, cache), list[Route]()
         for index, goal in enumerate(problem.goals):
-            start = problem.start if not before else before[-1].links[-1].stop.z
+            start = problem.start if not before else before[-1].edges[-1].stop.z
             place = make_place(problem.scene, start)
             if is_at(place, goal):
                 key = name_goal(problem.goals, index)
@@ -164,7 +164,7 @@ def forget_roadmaps() -> None:
 
 def _plan_to_goal(
     problem: Problem,
-    before: list[RoadmapRoute],
+    before: list[Route],
     search: RouteSearch,
     options: PlanOptions,
     alternatives: int,
@@ -174,38 +174,38 @@ def _plan_to_goal(
 ) -> Answer:
     """Plan routes to one goal, with a lower bound of the best one."""
     start = time.process_time()
-    chooser, complete = Chooser(problem, before, search, options, jobs), True
+    planner, complete = RoutePlanner(problem, before, search, options, jobs), True
     try:
         with yielding():
             report("looking for routes")
-            chooser.run(1 + alternatives, report)
+            planner.run(1 + alternatives, report)
     except OutOfTime:
-        if not chooser.made:
+        if not planner.made:
             text = f"the time limit is over, and there is no plan yet: {len(search.reached)} places"
             text += " looked at"
-            if chooser.found:
-                best = min(chooser.found, key=chooser.estimate)
-                count = sum(len(link.steps) for link in best.links)
-                duration = chooser.estimate(best)
+            if planner.found:
+                best = min(planner.found, key=planner.estimate)
+                count = sum(len(edge.steps) for edge in best.edges)
+                duration = planner.estimate(best)
                 text += f", a route of {count} phases found, of about {duration:.3g} s"
             raise SolverError(f"{text}; what it was at: {report.last}") from None
         complete = False
     except KeyboardInterrupt:
-        if hurry is None or not (chooser.made or chooser.found):
+        if hurry is None or not (planner.made or planner.found):
             raise
         complete = False
-        if not chooser.made:
+        if not planner.made:
             hurry()
-            chooser.first_only = True
-            chooser.plan(1, report)
+            planner.first_only = True
+            planner.plan(1, report)
     except np.linalg.LinAlgError:
         # Dependent contacts at a place that the search has reached.
         complete = False
-        if not chooser.made:
-            chooser.plan(1, report)
-    made = chooser.made
+        if not planner.made:
+            planner.plan(1, report)
+    made = planner.made
     if not made:
-        spent, failed = time.process_time() - start, chooser.failures
+        spent, failed = time.process_time() - start, planner.failures
         opening, changes, reason = (
             "",
             tuple[Change, ...](),
@@ -227,13 +227,13 @@ def _plan_to_goal(
     if complete and not before:
         try:
             with yielding():
-                bound = chooser.bound(plan.duration, route.in_cells)
+                bound = planner.bound(plan.duration, route.in_cells)
         except KeyboardInterrupt as error:
             if hurry is None and not isinstance(error, OutOfTime):
                 raise
             complete = False
     others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
-    failures, blocked = tuple(chooser.failures), tuple(search.blocked)
+    failures, blocked = tuple(planner.failures), tuple(search.blocked)
     return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
 
 
@@ -327,7 +327,7 @@ class Alternative(Result):
 class Answer(Alternative):
     """The best route that was found, with its plan."""
 
-    route: RoadmapRoute  # to the last goal
+    route: Route  # to the last goal
     # lower bound of routes along borders; None with several goals or an interrupted search
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]

@@ -1,7 +1,7 @@
-"""Lazily built roadmap of a scene: places at rest, links along borders and through cells.
+"""Lazily built roadmap of a scene: places at rest, edges along borders and through cells.
 
 It depends only on the scene, epsilon and the uniqueness margin: searches from any start to any goal
-share it. Links through cells follow rays, straight lines in (x, phi), to the contact they gain;
+share it. Edges through cells follow rays, straight lines in (x, phi), to the contact they gain;
 their least times come from a vectorized speed sweep. Each cell has one contact of palm and each
 finger, so there is no internal force, forces and torques follow from speed and acceleration, and
 all paths share one `LimitSet`.
@@ -33,17 +33,17 @@ from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
-from .edge_plans import Measured, PlannedLink
+from .edge_plans import CoarsePlan, PlannedEdge
 from .edges import (
     Blocked,
     BorderEdge,
+    Edge,
     EdgeStep,
-    Link,
     Terms,
     Unstopped,
     cut_curve,
+    edge_along,
     follow_borders,
-    link_along,
     point_out,
     time_parts,
 )
@@ -138,23 +138,23 @@ class Roadmap:
     Attributes
     ----------
     plans     plans of routes, or why there are none; see `edge_plans`
-    measured  plans of single links through cells, the best first; empty if there are none
-    refined   links whose place on the border has been optimized
-    joined    plans of links from rest to rest, or why there are none; see `edge_plans`
+    measured  plans of single edges through cells, the best first; empty if there are none
+    refined   edges whose place on the border has been optimized
+    joined    plans of edges from rest to rest, or why there are none; see `edge_plans`
     """
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
         self.scene, self.epsilon = problem.scene, problem.epsilon
         self.terms = Terms(problem.epsilon, uniqueness_margin)
-        self.refined: set[Link] = set()
+        self.refined: set[Edge] = set()
         self._borders: dict[tuple[Key, tuple[Contact, ...]], list[BorderEdge]] = {}
         self._curves: dict[frozenset[Contact], list[Curve]] = {}
         self._chains: dict[Key, list[Chain]] = {}
-        self._cells: dict[Key, list[Link]] = {}
+        self._cells: dict[Key, list[Edge]] = {}
         self.plans: dict[object, Plan | str] = {}
-        self.joined: dict[tuple[object, ...], PlannedLink | str] = {}
-        self.measured: dict[Link, list[Measured]] = {}
-        self._releases: dict[BorderEdge, list[Link]] = {}
+        self.joined: dict[tuple[object, ...], PlannedEdge | str] = {}
+        self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
+        self._releases: dict[BorderEdge, list[Edge]] = {}
         self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
 
     def trace(self, place: RoadmapPlace, chain: Chain | None = None) -> list[BorderEdge]:
@@ -187,40 +187,40 @@ class Roadmap:
         return self._longer[key]
 
     def set_out(self, place: RoadmapPlace, goal: Goal) -> Iterator[Ahead]:
-        """Links along borders from a place; along several only where a motion cannot stop."""
+        """Edges along borders from a place; along several only where a motion cannot stop."""
         for chain in self.follow(place):
             yield from self._list_ends(chain, goal)
 
     def go_on(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
-        """Feasible links that pass the end of a chain in motion; further ones as in `set_out`."""
+        """Feasible edges that pass the end of a chain in motion; further ones as in `set_out`."""
         for longer in self.extend(chain):
-            yield from (link for link in self._list_ends(longer, goal) if isinstance(link[1], Link))
+            yield from (edge for edge in self._list_ends(longer, goal) if isinstance(edge[1], Edge))
 
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
-        if chain.link is not None:
-            yield chain, chain.link, True
+        if chain.edge is not None:
+            yield chain, chain.edge, True
         if (ending := chain.end_at(goal)) is not None:
             yield chain, ending, False
-        if isinstance(chain.link, Blocked) and isinstance(chain.link.reason, Unstopped):
+        if isinstance(chain.edge, Blocked) and isinstance(chain.edge.reason, Unstopped):
             yield from self.go_on(chain, goal)
 
     def list_along(self, place: RoadmapPlace, goal: Goal) -> Iterator[Ahead]:
-        """All links along borders from a place to their ends or to a goal; of chains, feasible."""
+        """All edges along borders from a place to their ends or to a goal; of chains, feasible."""
         waiting = list(self.set_out(place, goal))
         while waiting:
-            chain, link, whole = waiting.pop()
-            yield chain, link, whole
-            if whole and isinstance(link, Link):
+            chain, edge, whole = waiting.pop()
+            yield chain, edge, whole
+            if whole and isinstance(edge, Edge):
                 waiting += self.go_on(chain, goal)
 
-    def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Link]:
-        """Links from rest at a place through the cells around it, and to a goal inside of them."""
+    def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
+        """Edges from rest at a place through the cells around it, and to a goal inside of them."""
         if place.key not in self._cells:
             self._cells[place.key] = cross((place,), self.epsilon)
         return [*self._cells[place.key], *self.end_in_cell(place, goal)]
 
-    def release(self, border: BorderEdge, among: Sequence[BorderEdge]) -> list[Link]:
-        """Links that leave a border for a cell, from the fastest of some places along it.
+    def release(self, border: BorderEdge, among: Sequence[BorderEdge]) -> list[Edge]:
+        """Edges that leave a border for a cell, from the fastest of some places along it.
 
         Those of all borders `among` are computed together, which takes less time.
         """
@@ -238,42 +238,42 @@ class Roadmap:
                 middle = make_place(self.scene, z[0])
                 for row, share, time in zip(z, RELEASES[free], times[free], strict=True):
                     sources[replace(middle, z=row)] = border, float(share), float(time)
-        best = dict[tuple[BorderEdge, tuple[Contact, ...]], Link]()
-        for link in cross(list(sources), self.epsilon) if sources else ():
-            border, share, time = sources[link.start]
-            key, duration = (border, link.stop.contacts), time + link.duration
-            if key not in best or duration < TIED * best[key].duration:
+        best = dict[tuple[BorderEdge, tuple[Contact, ...]], Edge]()
+        for edge in cross(list(sources), self.epsilon) if sources else ():
+            border, share, time = sources[edge.start]
+            key, duration = (border, edge.stop.contacts), time + edge.estimate
+            if key not in best or duration < TIED * best[key].estimate:
                 held = border.formation.contacts
-                steps = EdgeStep(held, point_out(held, link.start.z)), *link.steps
-                whole = replace(link, start=border.start, steps=steps, duration=duration)
+                steps = EdgeStep(held, point_out(held, edge.start.z)), *edge.steps
+                whole = replace(edge, start=border.start, steps=steps, estimate=duration)
                 best[key] = replace(whole, left=border.curve, share=share)
         for border in borders:
-            self._releases[border] = [link for (left, _), link in best.items() if left is border]
+            self._releases[border] = [edge for (left, _), edge in best.items() if left is border]
 
-    def land_at(self, links: Sequence[Link], goal: Goal) -> list[Link]:
-        """Copies of links that land on the edge of a goal with x, moved to land at this x.
+    def land_at(self, edges: Sequence[Edge], goal: Goal) -> list[Edge]:
+        """Copies of edges that land on the edge of a goal with x, moved to land at this x.
 
         Durations are kept; the planner decides on feasibility. A border before is left in motion:
         from rest at one place few others can be reached.
         """
         if goal.flush is None or goal.x is None:
             return []
-        moved, near = list[Link](), NEAR * self.scene.scales.length
-        for link in links:
-            *before, last = link.steps
-            if not is_flush(link.stop, goal.flush) or abs(link.stop.z[0] - goal.x) > near:
+        moved, near = list[Edge](), NEAR * self.scene.scales.length
+        for edge in edges:
+            *before, last = edge.steps
+            if not is_flush(edge.stop, goal.flush) or abs(edge.stop.z[0] - goal.x) > near:
                 continue
-            formation = Formation(self.scene, link.stop.contacts)
-            z = close_contacts(formation, link.stop.z, np.zeros(0), ((0, goal.x),))
+            formation = Formation(self.scene, edge.stop.contacts)
+            z = close_contacts(formation, edge.stop.z, np.zeros(0), ((0, goal.x),))
             if z is not None and is_inside(formation, z):
                 step = last._replace(until=replace(last.until, pins=(("x", goal.x),)))
-                stop = replace(link.stop, z=z)
+                stop = replace(edge.stop, z=z)
                 first = [EdgeStep(b.contacts, Until(), End.SMOOTH) for b in before]
-                moved.append(replace(link, stop=stop, steps=(*first, step), left=None))
+                moved.append(replace(edge, stop=stop, steps=(*first, step), left=None))
         return moved
 
-    def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> Iterator[Link]:
-        """Straight links from a place to a goal inside a cell around it; x is sampled if free."""
+    def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge]:
+        """Straight edges from a place to a goal inside a cell around it; x is sampled if free."""
         if goal.phi is None:
             return
         x = place.z[0] + np.linspace(-1.5, 1.5, 13) * self.scene.scales.length
@@ -282,12 +282,12 @@ class Roadmap:
         pins = () if goal.x is None else (("x", goal.x),)
         for formation in list_formations_at(place, 3):
             until = Until(None, "phi", goal.phi, pins)
-            link = go_to(place, formation, poses, until, self.epsilon)
-            if link is not None:
-                yield link
+            edge = go_to(place, formation, poses, until, self.epsilon)
+            if edge is not None:
+                yield edge
 
 
-def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Link]:
+def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
     """The fastest straight path through each cell to each contact, from places of one scene."""
     scene = places[0].scene
     rays = shoot(places, epsilon)
@@ -299,19 +299,19 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Link]:
             best[key] = k
     chosen = [best[key] for key in sorted(best)]
     z, table = place_at(scene, rays.labels[chosen], rays.ends[chosen]), contact_table(scene)
-    links = list[Link]()
+    edges = list[Edge]()
     for k, end in zip(chosen, z, strict=True):
         contacts, gained = tuple(table[c] for c in rays.labels[k]), table[rays.gained[k]]
         step, start = EdgeStep(contacts, Until(contact=gained)), places[rays.sources[k]]
         stop = RoadmapPlace(scene, end, (*contacts, gained), landed=True)
-        links.append(Link(start, stop, (step,), float(times[k]), True))
-    return links
+        edges.append(Edge(start, stop, (step,), float(times[k]), True))
+    return edges
 
 
 def go_to(
     start: RoadmapPlace, formation: Formation, poses: Array, until: Until, epsilon: float
-) -> Link | None:
-    """The fastest straight link from a place to one of some poses (x, phi) inside a cell."""
+) -> Edge | None:
+    """The fastest straight edge from a place to one of some poses (x, phi) inside a cell."""
     scene = start.scene
     label = np.array([contact_table(scene).index(contact) for contact in formation.contacts])
     begin = np.broadcast_to(start.z[[0, 2]], poses.shape)
@@ -330,7 +330,7 @@ def go_to(
         return None
     (z,) = place_at(scene, labels[:1], ends[k : k + 1])
     stop = RoadmapPlace(scene, z, formation.contacts, landed=True)
-    return Link(start, stop, (EdgeStep(formation.contacts, until),), float(times[k]), True)
+    return Edge(start, stop, (EdgeStep(formation.contacts, until),), float(times[k]), True)
 
 
 class Rays(NamedTuple):
@@ -474,24 +474,24 @@ class Chain:
         return None
 
     @cached_property
-    def link(self) -> Link | Blocked | None:
-        """The link along all of it; None where the last border ends at an obstacle."""
+    def edge(self) -> Edge | Blocked | None:
+        """The edge along all of it; None where the last border ends at an obstacle."""
         last = self.borders[-1]
-        return None if last.gained is None else self._link(Until(contact=last.gained), last)
+        return None if last.gained is None else self._edge(Until(contact=last.gained), last)
 
-    def end_at(self, goal: Goal) -> Link | Blocked | None:
-        """The link to a goal on the last border; None if there is none."""
+    def end_at(self, goal: Goal) -> Edge | Blocked | None:
+        """The edge to a goal on the last border; None if there is none."""
         last = self.borders[-1]
         place = measure_along(last.curve, goal)
         if place is None:
             return None
-        return self._link(place[1], replace(last, curve=cut_curve(last.curve, place[0])))
+        return self._edge(place[1], replace(last, curve=cut_curve(last.curve, place[0])))
 
-    def _link(self, until: Until, last: BorderEdge) -> Link | Blocked:
-        """The link to rest at the end of the last border, or of a part of it."""
+    def _edge(self, until: Until, last: BorderEdge) -> Edge | Blocked:
+        """The edge to rest at the end of the last border, or of a part of it."""
         steps = (*self.steps, EdgeStep(last.formation.contacts, until))
-        return link_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
+        return edge_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
 
 
-Ahead = tuple[Chain, Link | Blocked, bool]
-"""Borders, the link along them, and whether it follows the last one to its end."""
+Ahead = tuple[Chain, Edge | Blocked, bool]
+"""Borders, the edge along them, and whether it follows the last one to its end."""
