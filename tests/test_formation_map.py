@@ -721,8 +721,8 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     until = [str(phase.until) for phase in phases]
     (own,) = (
         edge
-        for _, edge, _ in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
-        if isinstance(edge, Edge) and [str(step.until) for step in edge.steps] == until
+        for edge in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
+        if [str(step.until) for step in edge.steps] == until
     )
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
     took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
@@ -748,9 +748,9 @@ def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     place = make_place(problem.scene, problem.start)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
     assert [
-        chain
-        for chain, *_ in chart.list_along(place, FAR_GOAL)
-        if chain.steps and str(chain.steps[0].until) == "v3-finger1"
+        edge
+        for edge in chart.list_along(place, FAR_GOAL)
+        if len(edge.steps) > 1 and str(edge.steps[0].until) == "v3-finger1"
     ] == []
 
 

@@ -46,7 +46,6 @@ from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import (
     FINEST,
-    Found,
     RefinedPath,
     ReleaseSearch,
     RouteSearch,
@@ -341,9 +340,9 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
 def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     """Paths through cells take longer away from a best place, and there is none beyond an end."""
 
-    def plan(path: RefinedPath) -> Found:
+    def plan(path: RefinedPath) -> CoarsePlan | None:
         if path.move is None or path.move < end:
-            return "no guess leads to a plan"
+            return None
         return CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
 
     found, *others = ReleaseSearch(plan, CoarsePlan(1 + FINEST * abs(best), (), [])).run()
@@ -354,9 +353,9 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
 def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
     """An edge that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
 
-    def plan(path: RefinedPath) -> Found:
+    def plan(path: RefinedPath) -> CoarsePlan | None:
         if path.move is None:
-            return "no guess leads to a plan"
+            return None
         z = np.full((1, 5), float(path.move))
         motion = SimpleNamespace(duration=0.0, evaluate=lambda _: SimpleNamespace(z=z, z_dot=z))
         begun: Any = [SimpleNamespace(motion=motion)]

@@ -19,6 +19,7 @@ from typing import NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
 from ..common.signals import beat
+from ..contacts.elemental import Contact
 from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
@@ -37,7 +38,7 @@ from .edge_plans import (
 )
 from .edges import ROUGHLY, Blocked, Edge, describe_steps, leave_at
 from .places import Key, RoadmapPlace, is_at
-from .roadmap import Ahead, Chain, Roadmap
+from .roadmap import Chain, Roadmap
 
 CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
 OFTEN = 2  # expansions of one place, on different routes
@@ -59,17 +60,17 @@ SETTLED = 240  # most places that are settled to bound routes from below
 T = TypeVar("T")
 
 
-class SearchRule(NamedTuple):
-    """Heuristic cost to go, in the scene's time, and a limit of the search."""
+class Heuristic(NamedTuple):
+    """Estimated cost to go, in the scene's time, and a limit of the search."""
 
     turning: float  # per radian that is left to turn
     leaving: float  # through a cell from a place along a border
     most: int  # most places that are expanded
 
 
-EAGER = SearchRule(14.0, 4.0, 130)
+EAGER = Heuristic(14.0, 4.0, 130)
 """As routes through cells take: greedy, leads to a first plan soon."""
-CAREFUL = SearchRule(4.0, 2.5, 50)
+CAREFUL = Heuristic(4.0, 2.5, 50)
 """Hardly any route takes less: finds routes that start in the wrong direction.
 
 Goal 3 of the corpus has a route that is 28 % faster behind 45 places. Another one of 16 % lies
@@ -81,7 +82,17 @@ behind 100 places in goal 26; looking that far takes goal 5 three times as long,
 class Route:
     """Edges one after the other."""
 
-    edges: tuple[Edge, ...]
+    start: RoadmapPlace
+    edges: tuple[Edge, ...] = ()
+
+    @property
+    def stop(self) -> RoadmapPlace:
+        """Where it leads."""
+        return self.edges[-1].stop if self.edges else self.start
+
+    def extend(self, edge: Edge) -> Route:
+        """The route with another edge."""
+        return Route(self.start, (*self.edges, edge))
 
     @property
     def estimate(self) -> float:
@@ -104,6 +115,12 @@ class Route:
         return self.signature, tuple(step.end for edge in self.edges for step in edge.steps)
 
 
+Pending = Chain | Callable[[], list[Edge]] | None
+"""What is looked at when a route is taken from the queue, beside the place to which it leads: the
+chain with which it may go on without a stop; or instead of the place edges that are costly to find.
+"""
+
+
 @dataclass(eq=False)
 class RouteSearch:
     """Routes from a start to a goal."""
@@ -124,79 +141,65 @@ class RouteSearch:
         phi, scene = float(place.z[2]), self.roadmap.scene
         return turning * scene.scales.time * abs(self.goal.find_angle(scene, phi) - phi)
 
-    def run(self, rule: SearchRule = EAGER) -> Iterator[Route]:
+    def run(self, heuristic: Heuristic = EAGER) -> Iterator[Route]:
         """Yield new routes, about in the order of their durations."""
         time = self.roadmap.scene.scales.time
-        number, times = count(), Counter[object]()
-        queue = list[tuple[float, int, Route, Chain | Expand | None]]()
+        number, times = count(), Counter[Key]()  # times: expansions of places
+        queue = list[tuple[float, int, Route, Pending]]()
 
-        def stop_of(route: Route) -> RoadmapPlace:
-            return route.edges[-1].stop if route.edges else self.start
+        def push(route: Route, pending: Pending = None, more: float = 0.0) -> None:
+            least = route.estimate + self.measure(route.stop, heuristic.turning) + more
+            heapq.heappush(queue, (least, next(number), route, pending))
 
-        def put(route: Route, work: Chain | Expand | None, more: float = 0.0) -> None:
-            least = route.estimate + self.measure(stop_of(route), rule.turning) + more
-            heapq.heappush(queue, (least, next(number), route, work))
-
-        def put_along(before: tuple[Edge, ...], ahead: Ahead) -> None:
-            chain, edge, whole = ahead
-            assert isinstance(edge, Edge)
-            put(Route((*before, edge)), chain if whole else None)
-
-        for source in self.sources or (Route(()),):
-            put(source, None)
+        for source in self.sources or (Route(self.start),):
+            push(source)
         for _ in range(MOST):
             if not queue:
                 return
             beat()
-            cost, _, route, work = heapq.heappop(queue)
-            place = stop_of(route)
-            if cost > self.limit or len(times) > rule.most:
+            least, _, route, pending = heapq.heappop(queue)
+            if least > self.limit or len(times) > heuristic.most:
                 return
-            if callable(work):
-                edges = work()
+            if callable(pending):
+                edges = pending()
                 for edge in (*edges, *self.roadmap.land_at(edges, self.goal)):
-                    put(Route((*route.edges, edge)), None)
+                    push(route.extend(edge))
                 continue
+            place = route.stop
             if route.edges and is_at(place, self.goal):
                 if route.key not in self.found:
                     self.found.add(route.key)
                     yield route
                 continue
-            if work is not None:
-                for ahead in self.roadmap.go_on(work, self.goal):
-                    put_along(route.edges[:-1], ahead)
-            key = place.key
-            if times[key] >= (1 if place.landed else OFTEN):
+            if pending is not None:
+                before = Route(route.start, route.edges[:-1])
+                for edge, chain in self.roadmap.go_on(pending, self.goal):
+                    push(before.extend(edge), chain)
+            if times[place.key] >= (1 if place.landed else OFTEN):
                 continue
-            times[key] += 1
-            self.reached.setdefault(key, route)
-            for ahead in list(self.roadmap.set_out(place, self.goal)):
-                if self._is_back(route, ahead[0]):
+            times[place.key] += 1
+            self.reached.setdefault(place.key, route)
+            for candidate, chain in self.roadmap.set_out(place, self.goal):
+                if self._is_back(route, candidate.steps[0].contacts):
                     continue
-                if isinstance(ahead[1], Edge):
-                    put_along(route.edges, ahead)
-                elif times[key] == 1 and ahead[1] not in self.blocked:
-                    self.blocked.append(ahead[1])
+                if isinstance(candidate, Edge):
+                    push(route.extend(candidate), chain)
+                elif times[place.key] == 1 and candidate not in self.blocked:
+                    self.blocked.append(candidate)
             if not place.landed:
-                # Through cells edges are costly: they are looked for when it is their turn.
-                chains = self.roadmap.follow(place)
-                borders = [c.borders[0] for c in chains if not self._is_back(route, c)]
+                every = (chain.borders[0] for chain in self.roadmap.follow(place))
+                borders = [b for b in every if not self._is_back(route, b.formation.contacts)]
                 for border in borders:
                     release = partial(self.roadmap.release, border, borders)
-                    put(route, release, rule.leaving * time)
-                put(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
+                    push(route, release, heuristic.leaving * time)
+                push(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
 
     @staticmethod
-    def _is_back(route: Route, chain: Chain) -> bool:
-        """Whether a chain begins with the border that a route has just followed."""
+    def _is_back(route: Route, contacts: Sequence[Contact]) -> bool:
+        """Whether contacts are those of the border that a route has just followed."""
         if not route.edges or route.edges[-1].in_cell:
             return False
-        last = route.edges[-1].steps[-1].contacts
-        return set(last) == set(chain.borders[0].formation.contacts)
-
-
-Found = CoarsePlan | str
-Expand = Callable[[], list[Edge]]
+        return set(route.edges[-1].steps[-1].contacts) == set(contacts)
 
 
 class RefinedPath(NamedTuple):
@@ -213,10 +216,12 @@ class ReleaseSearch:
     Least time of the edge and of a border that follows where it lands.
     """
 
-    plan: Callable[[RefinedPath], Found]
+    plan: Callable[[RefinedPath], CoarsePlan | None]
     best: CoarsePlan
     to_go: CostToGo | None = None  # time of what follows [s]
-    known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
+    known: dict[RefinedPath, CoarsePlan | None] = field(
+        default_factory=dict
+    )  # plans that were made before
     _tried: set[RefinedPath] = field(default_factory=set)
     _others: list[CoarsePlan] = field(default_factory=list)
     _least: float = math.inf  # time of the best plan and of what follows [s]
@@ -251,7 +256,7 @@ class ReleaseSearch:
             return False
         self._tried.add(path)
         plan = self.known[path] if path in self.known else self.plan(path)
-        if isinstance(plan, str):
+        if plan is None:
             return False
         time = time_with(self.to_go, plan)
         better = time < GAIN * self._least
@@ -273,7 +278,7 @@ class RoutePlanner:
     found: list[Route] = field(default_factory=list)  # their edges through cells have plans
     made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
-    _prefetched: dict[Edge, Found] = field(default_factory=dict)
+    _prefetched: dict[Edge, CoarsePlan | None] = field(default_factory=dict)
     _measurements: int = 0
     _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
@@ -387,10 +392,10 @@ class RoutePlanner:
             return bound_borders(self.search, wanted)
         return bound.up_to(wanted)
 
-    def _look_by(self, rule: SearchRule, wanted: int, report: Callable[[str], None]) -> None:
-        """Collect routes by one heuristic, while a better one is possible."""
+    def _look_by(self, heuristic: Heuristic, wanted: int, report: Callable[[str], None]) -> None:
+        """Collect routes by a heuristic, while a better one is possible."""
         looked, most = 0, self._measurements + MEASURED
-        for route in self.search.run(rule):
+        for route in self.search.run(heuristic):
             enough = len(self.found) >= wanted
             if enough and self.estimate(route) > self._best:
                 return
@@ -410,35 +415,27 @@ class RoutePlanner:
 
     def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
         """Plan the edges of a route that lead through cells; whether all have a plan."""
-        measured = self.roadmap.coarse_plans
         if self._is_lost(route):
             return False
-        kept = self._prefetched
-        new = [
-            edge
-            for edge in route.edges
-            if edge.in_cell and edge not in measured and edge not in kept
-        ]
+        plans, kept = self.roadmap.coarse_plans, self._prefetched
+        in_cells = [edge for edge in route.edges if edge.in_cell]
+        new = [edge for edge in in_cells if edge not in plans and edge not in kept]
         if self.jobs > 1 and len(new) > 1:
-            plans = self._share([partial(self._plan_coarsely, edge) for edge in new])
-            kept.update(zip(new, plans, strict=True))
-        for edge in route.edges:
-            if not edge.in_cell:
-                continue
-            if edge not in measured:
+            tasks = [partial(self._plan_coarsely, edge) for edge in new]
+            kept.update(zip(new, self._share(tasks), strict=True))
+        for edge in in_cells:
+            if edge not in plans:
                 self._measurements += 1
                 report(f"planning {describe_steps(edge.steps)}")
                 plan = kept.pop(edge) if edge in kept else self._plan_coarsely(edge)
-                measured[edge] = [] if isinstance(plan, str) else [plan]
-            if not measured[edge]:
+                plans[edge] = [plan] if plan else []
+            if not plans[edge]:
                 return False
         return True
 
     def _refine(self, route: Route, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
-        roadmap = self.roadmap
-        edges = list[Edge]()
-        searches = list[ReleaseSearch]()
+        roadmap, searches = self.roadmap, dict[Edge, ReleaseSearch]()
         for edge, after in pairwise((*route.edges, None)):
             if edge is None or edge.left is None or edge in roadmap.refined:
                 continue
@@ -446,47 +443,38 @@ class RoutePlanner:
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
-            searches.append(ReleaseSearch(partial(self._release, edge, to_go), plan, to_go))
-            edges.append(edge)
-        roadmap.refined.update(edges)
+            searches[edge] = ReleaseSearch(partial(self._release, edge, to_go), plan, to_go)
+        roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
+            (search,) = searches.values()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            first = self._share([partial(searches[0].plan, path) for path in paths])
-            searches[0].known = dict(zip(paths, first, strict=True))
-        results = self._share([search.run for search in searches])
-        for edge, (best, *others) in zip(edges, results, strict=True):
+            plans = self._share([partial(search.plan, path) for path in paths])
+            search.known = dict(zip(paths, plans, strict=True))
+        results = self._share([search.run for search in searches.values()])
+        for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
     def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene))
 
-    def _plan_coarsely(self, edge: Edge) -> Found:
+    def _plan_coarsely(self, edge: Edge) -> CoarsePlan | None:
         """Plan an edge through a cell, from other places of its border if that fails."""
         plan = plan_coarsely(self.problem, edge, edge.steps, self.options, further=True)
         for move in ELSEWHERE if edge.left else ():
             place = edge.share + move
-            if not isinstance(plan, str):
-                break
-            if INSIDE < place < 1 - INSIDE:
+            if plan is None and INSIDE < place < 1 - INSIDE:
                 plan = plan_coarsely(self.problem, edge, leave_at(edge, place), self.options)
         return plan
 
-    def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> Found:
+    def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> CoarsePlan | None:
         """Plan an edge that leaves its border at another place, or in motion."""
         place = None if path.move is None else edge.share + FINEST * path.move
         if place is not None and not INSIDE < place < 1 - INSIDE:
-            return "it is too near to the end of the border"
-        steps = leave_at(edge, place)
+            return None
         # In motion the first guess has no plan in goal 48 of the corpus.
-        return plan_coarsely(
-            self.problem,
-            edge,
-            steps,
-            self.options,
-            straight=path.straight,
-            first_only=place is not None,
-            to_go=to_go,
-        )
+        guesses = {"straight": path.straight, "first_only": place is not None}
+        steps = leave_at(edge, place)
+        return plan_coarsely(self.problem, edge, steps, self.options, **guesses, to_go=to_go)
 
     def _is_lost(self, route: Route) -> bool:
         """Whether a route contains edges that had no plan on another one."""
@@ -549,8 +537,7 @@ def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
                 break
             settled.add(place.key)
             if place.key not in edges_from:
-                every = search.roadmap.list_along(place, search.goal)
-                edges_from[place.key] = [edge for _, edge, _ in every if isinstance(edge, Edge)]
+                edges_from[place.key] = list(search.roadmap.list_along(place, search.goal))
             for edge in edges_from[place.key]:
                 least = edge.fine_bound if edge in refined else ROUGHLY * edge.bound
                 heapq.heappush(queue, (cost + least, next(order), edge.stop, (*route, edge)))

@@ -188,7 +188,7 @@ def find_opening(
             edge = edge_changed(cuts[k], change)
             if before is not None and isinstance(edge, Edge):
                 lasts[k] = edge
-                sources.append(Route((*before.edges, edge)))
+                sources.append(before.extend(edge))
         if not sources:
             return None
         result = _search_changed(changed, search.start.z, search.goal, options, planned, sources)

@@ -89,8 +89,8 @@ def plan_coarsely(
     straight: bool = True,
     first_only: bool = False,
     to_go: CostToGo | None = None,
-) -> CoarsePlan | str:
-    """Plan an edge through a cell alone, on few intervals; the plan, or why there is none.
+) -> CoarsePlan | None:
+    """Plan an edge through a cell alone, on few intervals; None if there is no plan.
 
     Parameters
     ----------
@@ -115,18 +115,14 @@ def plan_coarsely(
             goal = replace(edge.stop, z=find_end(phases[0], z, phases[1:]))
         moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
         if moved < (STILL * problem.scene.scales.length) ** 2:
-            return f"{phases[0].until} holds already where it starts"
+            return None  # `until` holds already where it starts.
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
         plans = try_phases(single, phases, z, rough, towards, further and alone, first_only, to_go)
-    except NoMotionError:
-        return "no motion keeps its limits along the border"
-    except WholearmError as error:
-        return str(error)
-    except np.linalg.LinAlgError:
-        return DEPENDENT
+    except (NoMotionError, WholearmError, np.linalg.LinAlgError):
+        return None
     if plans is None:
-        return "no guess leads to a plan"
+        return None
     return CoarsePlan(spent + sum(plan.motion.duration for plan in plans), steps, plans)
 
 

@@ -119,7 +119,7 @@ def find_route_with(
             require_folder(cache)
         roadmap, before = get_roadmap(problem, options, cache), list[Route]()
         for index, goal in enumerate(problem.goals):
-            start = problem.start if not before else before[-1].edges[-1].stop.z
+            start = problem.start if not before else before[-1].stop.z
             place = make_place(problem.scene, start)
             if is_at(place, goal):
                 key = name_goal(problem.goals, index)

@@ -186,32 +186,40 @@ class Roadmap:
             self._longer[key] = [longer for longer in chains if longer]
         return self._longer[key]
 
-    def set_out(self, place: RoadmapPlace, goal: Goal) -> Iterator[Ahead]:
-        """Edges along borders from a place; along several only where a motion cannot stop."""
+    def set_out(
+        self, place: RoadmapPlace, goal: Goal
+    ) -> Iterator[tuple[Edge | Blocked, Chain | None]]:
+        """Edges along borders from a place, with the chains that may go on from where they end.
+
+        They follow several borders only where a motion cannot stop.
+        """
         for chain in self.follow(place):
             yield from self._list_ends(chain, goal)
 
-    def go_on(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
+    def go_on(self, chain: Chain, goal: Goal) -> Iterator[tuple[Edge, Chain | None]]:
         """Feasible edges that pass the end of a chain in motion; further ones as in `set_out`."""
         for longer in self.extend(chain):
-            yield from (edge for edge in self._list_ends(longer, goal) if isinstance(edge[1], Edge))
+            for edge, ahead in self._list_ends(longer, goal):
+                if isinstance(edge, Edge):
+                    yield edge, ahead
 
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
         if chain.edge is not None:
-            yield chain, chain.edge, True
+            yield chain.edge, chain
         if (ending := chain.end_at(goal)) is not None:
-            yield chain, ending, False
+            yield ending, None
         if isinstance(chain.edge, Blocked) and isinstance(chain.edge.reason, Unstopped):
             yield from self.go_on(chain, goal)
 
-    def list_along(self, place: RoadmapPlace, goal: Goal) -> Iterator[Ahead]:
-        """All edges along borders from a place to their ends or to a goal; of chains, feasible."""
+    def list_along(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge]:
+        """All feasible edges along borders from a place to their ends or to a goal."""
         waiting = list(self.set_out(place, goal))
         while waiting:
-            chain, edge, whole = waiting.pop()
-            yield chain, edge, whole
-            if whole and isinstance(edge, Edge):
-                waiting += self.go_on(chain, goal)
+            edge, chain = waiting.pop()
+            if isinstance(edge, Edge):
+                yield edge
+                if chain:
+                    waiting += self.go_on(chain, goal)
 
     def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
         """Edges from rest at a place through the cells around it, and to a goal inside of them."""
@@ -493,5 +501,5 @@ class Chain:
         return edge_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
 
 
-Ahead = tuple[Chain, Edge | Blocked, bool]
-"""Borders, the edge along them, and whether it follows the last one to its end."""
+Ahead = tuple[Edge | Blocked, Chain | None]
+"""An edge along borders, and the chain that may go on where it ends; None at a goal."""
