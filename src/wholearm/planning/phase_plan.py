@@ -132,7 +132,7 @@ def share_duration(
         text = f"{where}duration = {duration:g} s is not longer than the least time{stops}, "
         text += f"{least:.6g} s" + (f"; {describe_changes(changes)}" if changes else "")
         raise InfeasibleError(text, changes=changes)
-    return [duration * time / least for time in times]
+    return [duration / least * time for time in times]
 
 
 def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:

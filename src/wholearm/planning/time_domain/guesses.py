@@ -1,9 +1,10 @@
 """Initial guesses of phases that are one NLP: one ordered list, each with its name.
 
-A guess follows a path from geometry alone, from rest to rest in time. Contact modes are those of
-the path, or those of a motion with smoothed friction, tanh(rate / onset) in place of the sign
-(friction homotopy): such a motion needs no modes, and is split into stages by the signs of its
-rates. A contact whose rate rests there for a while, so that its friction is not all used, rolls.
+A guess follows a path from geometry alone, from rest to rest in time, or a plan. Contact modes are
+those of the path, or those of a motion with smoothed friction, tanh(rate / onset) in place of the
+sign (friction homotopy), which needs no modes. Both are split into stages by the signs of their
+rates. A contact whose rate rests for a while with smoothed friction, so that this is not all used,
+rolls.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby, pairwise
 from operator import truediv
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -264,7 +265,10 @@ class Guesses:
         return Guess(name, self._leave_room(stages))
 
     def every(self, goal: Array | None = None) -> Iterator[Guess]:
-        """All of them in their order; where the end is given or pinned, straight there is first."""
+        """All of them in their order, as the table of the README lists them.
+
+        `goal`: the end of the first, straight one; without it, that of a phase with pins.
+        """
         given = goal is not None
         if not given and self._is_planar() and self.phases[0].until.pins:
             goal = find_end(self.phases[0], self.z)
@@ -296,22 +300,21 @@ class Guesses:
             return None
 
         goals, sides = [nearest], list[Array]()
-        for direction in (*N.T, *-N.T):
-            goal = project(nearest + step * direction, nearest, step)
-            # Directions across the ends lead back to the same.
-            if goal is not None and all((goal - nearest) @ (s - nearest) <= 0 for s in sides):
-                sides.append(goal)
-        for side in sides:
-            goal, last, length = side, nearest, step
+        for secant in (*N.T, *-N.T):
+            last, length = nearest, step
             for _ in range(12):  # most ends on either side of the nearest one
+                goal = project(last + length * secant, last, length)
+                if goal is None:
+                    break
+                if last is nearest:
+                    # Directions across the ends lead back to the same.
+                    if any((goal - nearest) @ (side - nearest) > 0 for side in sides):
+                        break
+                    sides.append(goal)
                 goals.append(goal)
                 secant = (goal - last) * metric
-                length *= 1.2  # ratio of successive distances
-                secant = length * secant / np.linalg.norm(secant) / metric
-                following = project(goal + secant, goal, length)
-                if following is None:
-                    break
-                last, goal = goal, following
+                secant = secant / np.linalg.norm(secant) / metric
+                last, length = goal, 1.2 * length  # ratio of successive distances
         return goals
 
     def _guess(self, outlines: Sequence[PathGuess] = ()) -> list[Stage]:

@@ -371,11 +371,13 @@ def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) 
         c_n = stage.guess.forces[..., row].ravel()
         c_t = stage.guess.forces[..., n_c + k].ravel()
         mu = formation.friction[row]
-        near = mu * (c_n - epsilon) - np.abs(c_t) < 1e-4 * mu * c_n  # about to slide
+        rounding = 1e-4 * mu * c_n
+        near = mu * (c_n - epsilon) - np.abs(c_t) < rounding  # about to slide
         for sign in (1.0, -1.0):
             leaning = np.zeros((len(c_n), n_c + 2), dtype=bool)
-            # Friction pushes against sliding.
-            leaning[:, row] = near & (sign * c_t < 0)
+            # Friction pushes against sliding. At c_n = epsilon its sign is that of rounding: both
+            # directions count (goal 45).
+            leaning[:, row] = near & (sign * c_t < rounding)
             runs += _find_runs(leaning, stage, scheme, np.full(n_c + 2, sign))
     return runs
 

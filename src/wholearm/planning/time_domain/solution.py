@@ -169,6 +169,10 @@ class TimeSearch:
         """Whether the objective `margin` is saturated."""
         return self.goal is Objective.MARGIN and solution.margin > self.most_margin
 
+    def measure(self, cost: float) -> float:
+        """Size of a value of the objective."""
+        return abs(cost) + self.problem.epsilon * (self.goal is Objective.MARGIN)
+
     @property
     def most_margin(self) -> float:
         """Margin at which the objective saturates."""
@@ -290,6 +294,7 @@ class RefinementSettings:
 
 
 SETTINGS = RefinementSettings()
+COSTLY = "limits between points cost too much"  # status
 _STEP = 1e-6  # step of z for slopes of gaps, over accelerations of a torque of 1
 
 
@@ -304,8 +309,7 @@ class CheckPlaces(NamedTuple):
 def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     """Refine a solution until it is accurate and keeps limits between points."""
     refined, coarse, failed = 0, math.nan, False
-    least = abs(solution.cost) + search.problem.epsilon * (search.goal is Objective.MARGIN)
-    highest = solution.cost + SETTINGS.increase * least
+    highest = solution.cost + SETTINGS.increase * search.measure(solution.cost)
     raised = [LimitMisses.none(stage) for stage in solution.stages]
     depth = SETTINGS.graze * search.problem.scene.scales.length
     for _ in range(SETTINGS.iterates):
@@ -340,7 +344,7 @@ def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         most = SETTINGS.patience * (2 if search.problem.scene.has_slow_motors else 1)
         better = search.solve(stages, solution, most, raised)
         if better.success and better.cost > highest:
-            return better._replace(status="limits between points cost too much", success=False)
+            return better._replace(status=COSTLY, success=False)
         if better.success:
             coarse, solution, failed = solution.cost, better, False
             continue
@@ -475,7 +479,7 @@ def _find_gains(
     stages, epsilon = solution.stages, search.problem.epsilon
     if stages[0].periods:
         return [np.zeros(stage.intervals) for stage in stages]
-    size = abs(solution.cost) + epsilon * (search.goal is Objective.MARGIN)
+    size = search.measure(solution.cost)
     if search.problem.scene.has_slow_motors:
         limit, shares = search.problem.scene.torque_limit, list[Array]()
         for part in (stage.guess for stage in stages):

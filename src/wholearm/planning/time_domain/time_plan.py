@@ -40,7 +40,7 @@ from .mode_search import (
     list_neighbours,
     sign_sequence,
 )
-from .solution import Price, TimeSearch, TimeSolution, keep_within, refine
+from .solution import COSTLY, Price, TimeSearch, TimeSolution, keep_within, refine
 from .stage import (
     Scheme,
     Stage,
@@ -330,7 +330,7 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         return searched
     search, coarse = choose_end(search, searched)
     refined = refine(search, coarse)
-    if not refined.success and search.options.mode_search:
+    if not refined.success and search.options.mode_search and refined.status != COSTLY:
         # Phase 2 of the route of query 10 has no solution in which a contact turns back without
         # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
         # search leads.
