@@ -305,10 +305,11 @@ def find_fastest(data: PhaseData) -> Fastest | None:
     return Fastest(s, b, modes, samples.find_switches(here, share, index))
 
 
-def equidistribute(part: PhaseData, motion: PathMotion, elements: int) -> Array:
-    """Breaks between elements that share changes of torque rates evenly [m] (de Boor).
+def equidistribute(part: PhaseData, motion: PathMotion, costs: Array, elements: int) -> Array:
+    """Breaks between elements that share costs and changes of torque rates evenly [m] (de Boor).
 
-    Half of the density over time is even, half the root of the variation of the rates.
+    Of the density over time equal shares are even, the root of the variation of the rates, and the
+    cube root of the `costs` of keeping limits between nodes, shape (N + 1,).
     """
     rates = find_torques(part, motion.profile, [motion])[1]
     most = np.maximum(np.abs(rates).max(axis=(0, 1)), part.torque_limit / motion.duration)
@@ -317,7 +318,9 @@ def equidistribute(part: PhaseData, motion: PathMotion, elements: int) -> Array:
     ends = motion.times.reshape(-1, NODES)
     spans = ends[:, -1] - ends[:, 0]
     density = np.sqrt(variation * spans)
-    shares = density / density.sum() + spans / motion.duration
+    dear = np.cbrt(costs.reshape(len(spans), -1).sum(axis=1))
+    parts = density, spans, dear
+    shares = np.sum([part / max(part.sum(), 1e-300) for part in parts], axis=0)
     done, t = np.append(0.0, np.cumsum(shares)), np.append(ends[:, 0], ends[-1, -1])
     stops = part.grid.edges[:, 1]
     fixed = np.array(

@@ -39,7 +39,7 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import SweepMode
-from ..nlp import Columns, SolverStatistics, book, build_solver
+from ..nlp import Columns, Solver, SolverStatistics, book, build_solver
 from ..options import Objective
 from .path_data import PhaseData
 from .path_mesh import Fastest
@@ -232,7 +232,9 @@ class Tightening(NamedTuple):
 class PathNLP:
     """A built NLP."""
 
-    solver: Expression  # takes x0, p, bounds and multipliers; see `build_path_nlp` for their order
+    # both take x0, p, bounds and multipliers; see `build_path_nlp` for their order
+    solver: Solver
+    starter: Solver  # for points that are no solution, with slacks near the central path
     shape: LimitShape
     intervals: int
     objective: Objective
@@ -364,9 +366,17 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     if slow:
         # Large gradients of the time next to rest would scale the objective down.
         strategy |= {"nlp_scaling_method": "none"}
+    if slow and objective not in SOFT:
+        # Probing lowers the barrier at once, and steps along the bounds of rates are short then.
+        strategy |= {"mu_oracle": "quality-function"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    starter = solver
+    if slow and objective not in SOFT:
+        derived = {"jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l", "grad_f": "nlp_grad_f"}
+        same = {key: solver.function.get_function(name) for key, name in derived.items()}
+        starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
     node = Columns(b=1, a=1, lam=1, extra=extra.shape[1])
-    return PathNLP(solver, shape, intervals, objective, node, p, g)
+    return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
 
 
 def parameters(

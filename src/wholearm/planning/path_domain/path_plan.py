@@ -64,7 +64,7 @@ SOLVES = 40  # most of one refinement
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
-_START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
+_START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
 WORTH = 0.02  # largest relative cost of such a start
 
 
@@ -152,7 +152,7 @@ def plan_task(task: Task, insist: bool = True) -> PathIterate:
     """Solve and refine; unless to `insist`, only where a sweep or a guess shows a motion."""
     for curve, phase in zip(task.curves, task.phases, strict=True):
         require_unique(curve, task.options.uniqueness_margin, phase)
-    first = PathIterate.begin(task, task.elements)
+    first = PathIterate.begin(task, min(task.elements, _START) if task.is_held else task.elements)
     if not insist and not first.is_kept:
         raise SolverError("no motion keeps the limits")
     accuracy = task.options.accuracy
@@ -336,7 +336,7 @@ class Task:
 
     @property
     def elements(self) -> int:
-        """Initial number of elements of each phase."""
+        """Number of elements of each phase, before some are halved; fewer in a first solve."""
         if self.options.intervals is None:
             few = _SMOOTH if self.options.goal is Objective.EFFORT else _START
             return _RATE if self.is_held else few
@@ -466,10 +466,10 @@ class PathIterate:
         return replace(self, solution=PathSolution(profile, margin, multipliers))
 
     def restart(self) -> PathIterate | None:
-        """The solution on the mesh before with tightened limits, or twice the elements, once."""
+        """The solution on the mesh before with tightened limits, or more elements, once."""
         if self.before is not None:
             return replace(self.before.tighten(), meshes=SOLVES)
-        elements = 2 * self.task.elements
+        elements = (1 if self.task.is_held else 2) * self.task.elements
         if len(self.parts[0].grid.edges) >= elements:
             return None
         return PathIterate.begin(self.task, elements)
@@ -480,13 +480,14 @@ class PathIterate:
         bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
         if (bounds["lbg"] > bounds["ubg"]).any():
             raise SolverError("limits that hold between the nodes too leave nothing")
-        result = nlp.solver(
+        solver = nlp.starter if np.isinf(start.cost) else nlp.solver
+        result = solver(
             x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
             p=parameters(nlp, data, units, task.options.time_weight),
             **bounds,
             **start.multipliers,
         )
-        stats = nlp.solver.stats()
+        stats = solver.stats()
         if not stats["success"]:
             raise SolverError(f"Ipopt stopped with {stats['return_status']}")
         profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
@@ -504,10 +505,12 @@ class PathIterate:
         if task.guides and again and self.violation_at_nodes > 0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
-        if task.is_held and self.meshes < 2:
-            each = zip(self.parts, self.motions, strict=True)
-            return self._move([equidistribute(*pair, task.elements) for pair in each], self.cuts)
         costs = self.due + self.paid
+        shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
+        if task.is_held and self.meshes < 2:
+            each = zip(self.parts, self.motions, shares, strict=True)
+            placed = [equidistribute(*phase, task.elements) for phase in each]
+            return self._move(placed, self.cuts, task.elements)
         costly = _GAP * float(costs.sum()) > accuracy
         if (self.meshes == 0 or costly) and self.meshes < SOLVES:
             # Neither least effort nor tightened limits show where the switches are.
@@ -522,20 +525,23 @@ class PathIterate:
                 breaks = tuple(places for places, _ in matches)
                 shift = max(distance for _, distance in matches)  # over the curve's length
             if shift > 25.0 * accuracy and again:  # over length and accuracy
-                return self._move(breaks, self.cuts)
+                return self._move(breaks, self.cuts, task.elements)
             edges = [part.grid.edges for part in self.parts]
-            count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
-            if costly and task.options.intervals is None and 2 * count >= task.elements:
-                shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
+            size = max(map(len, edges))
+            wanted = task.elements // 2 if task.is_held else task.elements
+            count = min(wanted, 80 - size)  # most elements of a phase
+            if costly and task.options.intervals is None and 2 * count >= wanted:
                 pairs = zip(edges, shares, strict=True)
-                return self._move(breaks, [halve(*pair, count) for pair in pairs])
+                return self._move(breaks, [halve(*pair, count) for pair in pairs], size + count)
         return self.tighten() if self.violation > 1 else None
 
-    def _move(self, breaks: Sequence[Array], cuts: Sequence[Array]) -> PathIterate:
-        """Start on other elements from this motion."""
+    def _move(
+        self, breaks: Sequence[Array], cuts: Sequence[Array], elements: int
+    ) -> PathIterate:
+        """Start on at least so many other elements from this motion."""
         every = zip(self.task.curves, breaks, cuts, strict=True)
         ends = [keep_apart(curve, np.append(places, more)) for curve, places, more in every]
-        parts, old = self.task.lay_out(ends, self.task.elements), self.solution
+        parts, old = self.task.lay_out(ends, elements), self.solution
         grid = join(parts).grid
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
