@@ -20,7 +20,9 @@ from .path_data import PhaseData, find_torques
 from .path_motion import DEGREE, NODES, Grid, PathMotion, Profile, lay_out
 
 _CAPPED = np.iinfo(np.int64).max  # label of places with an active speed limit
-_APART = 1e-5  # least length of an element that switches lead to, over the curve's
+# Least length of an element that switches lead to, over the curve's; and under rate limits, as the
+# time from rest is the cube root of the distance: phase 1 of the hexagon at 500 N m/s.
+_APART, _APART_HELD = 1e-5, 1e-8
 # Distance of s'' from its largest, over the range that limits allow, in intervals of a sweep.
 _SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
 
@@ -97,12 +99,16 @@ def match(breaks: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Arra
     return keep_apart(curve, np.array(every)), shift
 
 
-def keep_apart(curve: Curve, places: Array) -> Array:
-    """Increasing places with a least distance to reversals and to those before in the list [m]."""
+def keep_apart(curve: Curve, places: Array, held: bool = False) -> Array:
+    """Increasing places with a least distance to reversals and to those before in the list [m].
+
+    It is smaller where motions start and end without acceleration (`held`).
+    """
+    least = (_APART_HELD if held else _APART) * curve.length
     kept = find_ends(curve, np.zeros(0)).tolist()
     count = len(kept)
     for place in places.tolist():
-        if min(abs(place - other) for other in kept) > _APART * curve.length:
+        if min(abs(place - other) for other in kept) > least:
             kept.append(place)
     return np.sort(kept[count:])
 

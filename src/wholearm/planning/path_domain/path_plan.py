@@ -507,16 +507,17 @@ class PathIterate:
             return replace(other, meshes=self.meshes + 1)
         costs = self.due + self.paid
         shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
-        if task.is_held and self.meshes < 2:
-            each = zip(self.parts, self.motions, shares, strict=True)
-            placed = [equidistribute(*phase, task.elements) for phase in each]
-            return self._move(placed, self.cuts, task.elements)
         costly = _GAP * float(costs.sum()) > accuracy
-        if (self.meshes == 0 or costly) and self.meshes < SOLVES:
+        if task.is_held and (self.meshes < 2 or (costly and self.meshes < 4)):
+            grow = self.meshes >= 2 and task.options.intervals is None
+            count = task.elements * 3 // 2 if grow else task.elements
+            each = zip(self.parts, self.motions, shares, strict=True)
+            return self._move([equidistribute(*phase, count) for phase in each], self.cuts, count)
+        if not task.is_held and (self.meshes == 0 or costly) and self.meshes < SOLVES:
             # Neither least effort nor tightened limits show where the switches are.
             breaks, shift = self.breaks, 0.0
             tight = bool(self.tightening.missed.any())
-            if not (task.is_held or task.options.goal is Objective.EFFORT or tight):
+            if not (task.options.goal is Objective.EFFORT or tight):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
                 matches = [
                     match(before, find_switches(part, motion.profile, margin), part.curve)
@@ -527,12 +528,11 @@ class PathIterate:
             if shift > 25.0 * accuracy and again:  # over length and accuracy
                 return self._move(breaks, self.cuts, task.elements)
             edges = [part.grid.edges for part in self.parts]
-            size = max(map(len, edges))
-            wanted = task.elements // 2 if task.is_held else task.elements
-            count = min(wanted, 80 - size)  # most elements of a phase
-            if costly and task.options.intervals is None and 2 * count >= wanted:
+            count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
+            if costly and task.options.intervals is None and 2 * count >= task.elements:
                 pairs = zip(edges, shares, strict=True)
-                return self._move(breaks, [halve(*pair, count) for pair in pairs], size + count)
+                halved = [halve(*pair, count) for pair in pairs]
+                return self._move(breaks, halved, task.elements)
         return self.tighten() if self.violation > 1 else None
 
     def _move(
@@ -540,7 +540,10 @@ class PathIterate:
     ) -> PathIterate:
         """Start on at least so many other elements from this motion."""
         every = zip(self.task.curves, breaks, cuts, strict=True)
-        ends = [keep_apart(curve, np.append(places, more)) for curve, places, more in every]
+        held = self.task.is_held
+        ends = [
+            keep_apart(curve, np.append(places, more), held) for curve, places, more in every
+        ]
         parts, old = self.task.lay_out(ends, elements), self.solution
         grid = join(parts).grid
         profile = Elements(self.data.grid, old.profile).move(grid)
