@@ -535,15 +535,11 @@ class PathIterate:
                 return self._move(breaks, halved, task.elements)
         return self.tighten() if self.violation > 1 else None
 
-    def _move(
-        self, breaks: Sequence[Array], cuts: Sequence[Array], elements: int
-    ) -> PathIterate:
+    def _move(self, breaks: Sequence[Array], cuts: Sequence[Array], elements: int) -> PathIterate:
         """Start on at least so many other elements from this motion."""
         every = zip(self.task.curves, breaks, cuts, strict=True)
         held = self.task.is_held
-        ends = [
-            keep_apart(curve, np.append(places, more), held) for curve, places, more in every
-        ]
+        ends = [keep_apart(curve, np.append(places, more), held) for curve, places, more in every]
         parts, old = self.task.lay_out(ends, elements), self.solution
         grid = join(parts).grid
         profile = Elements(self.data.grid, old.profile).move(grid)
