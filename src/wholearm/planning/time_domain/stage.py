@@ -143,7 +143,8 @@ class Stage:
     ahead: tuple[int, float, float] | None = None
     stop: Array | None = None  # (5,): the given end of the last stage
     periods: tuple[int, ...] = ()  # control period of each interval, if torques are held
-    period: float = 0.0  # duration of a control period, in the scene's unit
+    # duration of a control period, in the scene's unit; 0 if all are equal and of any duration
+    period: float = 0.0
     onset: float = 0.0  # of the friction homotopy, tanh(rate / onset), if not 0
 
     @property

@@ -631,7 +631,10 @@ class _Piece(NamedTuple):
 
 
 def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
-    """Durations of control periods, and their torques, constant or linear and continuous."""
+    """Durations of control periods, and their torques, constant or linear and continuous.
+
+    Without a given duration all periods but the last of a phase, which may be shorter, are equal.
+    """
     scene, duration = stages[0].formation.scene, stages[0].period
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
     pieces = [
@@ -639,21 +642,29 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
         for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
         for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
     ]
+    first: Indices | None = None  # durations of the parts of the first period that is not a last
     for _, pairs in groupby(pieces, key=lambda pair: pair[0]):
         phase = [piece for _, piece in pairs]
         last = phase[-1].period
         for period, group in groupby(phase, key=lambda piece: piece.period):
             parts, least = list(group), 0.0 if period == last else duration
-            whole = rows.linear(1, low=least, high=duration)
-            rows.add_entries(whole, np.array([piece.h for piece in parts]), 1.0)
+            spans = np.array([piece.h for piece in parts])
+            if duration or first is not None:
+                low = least if duration or period != last else -np.inf
+                whole = rows.linear(1, low=low, high=duration)
+                rows.add_entries(whole, spans, 1.0)
+                if not duration:
+                    rows.add_entries(whole, first, -1.0)
+            elif period != last:
+                first = spans
             for one, other in pairwise(parts):
                 if one.stage == other.stage:
                     even, size = rows.linear(1), one.share + other.share
                     rows.add_entries(even, np.array([one.h]), other.share / size)
                     rows.add_entries(even, np.array([other.h]), -one.share / size)
                 if linear:
-                    spans = {"h": np.array([one.h]), "coming": np.array([other.h])}
-                    slopes = {"before": one.tau, "after": other.tau} | spans
+                    slopes = {"before": one.tau, "after": other.tau}
+                    slopes |= {"h": np.array([one.h]), "coming": np.array([other.h])}
                     rows.add_copies(slope_kernel(), slopes)
         for before, after in pairwise(phase):
             if not goes_on and (linear or before.period == after.period):

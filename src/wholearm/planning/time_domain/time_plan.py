@@ -354,8 +354,9 @@ def hold_torques(
 ) -> TimeSolution:
     """The plan with torques held over control periods, from one with free torques.
 
-    The first duration is taken that leads to a solution. As every period but the last of a phase
-    has its duration, shorter ones are then tried by bisection, each from the last solution.
+    How many periods each phase takes follows from the motion with as many periods of one duration
+    that is free: that is solved again while it takes another number of given periods. The NLP then
+    shortens the last period of each phase.
 
     Raises
     ------
@@ -367,38 +368,30 @@ def hold_torques(
     controls = 2 if scene.control_hold == "linear" else 1
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
 
-    def solve(stages: list[Stage], period: float, stretch: float, least: int = 1) -> TimeSolution:
-        return held.solve(cut_periods(stages, held.scheme, period, stretch, least), most=80)
-
-    def shorten(solution: TimeSolution, most: int) -> TimeSolution:
-        """The solution without so many last periods that have vanished."""
-        for _ in range(most):
-            stages = drop_periods(solution.stages)
-            fewer = held.solve(stages, most=80) if stages else solution
-            if not stages or not fewer.success or fewer.cost > solution.cost:
-                break
-            solution = fewer
-        return solution
+    def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
+        return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=ITERATIONS)
 
     def hold(period: float) -> TimeSolution | None:
-        low = 1.0
-        # Durations over those with free torques, and least numbers of periods.
-        for high, least in ((1.0, 2), (1.15, 4), (1.5, 6), (2.2, 8)):
-            solution = solve(free, period, high, least)
+        stages = free
+        for _ in range(4):  # most times that numbers of periods change
+            solution = solve(stages, period, 1.0, equal=True)
+            if not solution.success:
+                break
+            before, stages = stages, solution.stages
+            if count_periods(before, period) == count_periods(stages, period):
+                break
+        stretch = 1.0
+        for _ in range(6):  # most durations; phase 3 of query 0 takes 5 at 5 ms
+            solution = solve(stages, period, stretch, equal=False)
             if solution.success:
                 break
-            low = high
-        if not solution.success:
-            return None
-        solution = shorten(solution, 4)
-        whole = sum(stage.guess.duration for stage in free)
-        high = sum(stage.guess.duration for stage in solution.stages) / whole
-        while (high - low) * whole > 0.5 * period:
-            middle = math.sqrt(high * low)
-            shorter = solve(solution.stages, period, middle / high)
-            solution = shorter if shorter.success else solution
-            low, high = (low, middle) if shorter.success else (middle, high)
-        solution = refine(held, shorten(solution, 100))
+            stretch += max(0.02, period / sum(stage.guess.duration for stage in stages))
+        while solution.success and (shorter := drop_periods(solution.stages)):
+            fewer = held.solve(shorter, most=ITERATIONS)
+            if not fewer.success or fewer.cost > solution.cost:
+                break
+            solution = fewer
+        solution = refine(held, solution) if solution.success else solution
         return solution if solution.success else None
 
     for share in (1.0, 0.5, 0.2):
@@ -432,17 +425,25 @@ def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
     return dropped if changed else []
 
 
+def count_periods(stages: Sequence[Stage], period: float) -> list[int]:
+    """How many periods each phase takes, the last of which may be shorter."""
+    phases = groupby(stages, key=lambda stage: stage.phase)
+    times = [sum(stage.guess.duration for stage in group) for _, group in phases]
+    return [max(1, math.ceil(time / period - _BRIEF)) for time in times]
+
+
 def cut_periods(
-    stages: Sequence[Stage], scheme: Scheme, period: float, stretch: float = 1.0, least: int = 1
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    period: float,
+    stretch: float = 1.0,
+    equal: bool = False,
 ) -> list[Stage]:
     """Stages whose intervals are periods or parts of them, stretched in time.
 
-    From rest to rest they last at least half a period less than `least` periods.
+    The duration of periods is then given, or only that they are `equal`.
     """
-    cut = list[Stage]()
-    whole = sum(stage.guess.duration for stage in stages)
-    stretch = max(stretch, (least - 0.5) * period / whole)
-    near = _BRIEF * period
+    cut, near = list[Stage](), _BRIEF * period
     for _, group in groupby(stages, key=lambda stage: stage.phase):
         start = 0.0
         for stage in group:
@@ -452,7 +453,7 @@ def cut_periods(
             numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
             part = resample(stage.guess, scheme, (edges - start) / (stop - start))
             longer = replace(stage, guess=with_controls(part, scheme.controls)).stretch(stretch)
-            cut.append(replace(longer, periods=numbers, period=period))
+            cut.append(replace(longer, periods=numbers, period=0.0 if equal else period))
             start = stop
     return cut
 
