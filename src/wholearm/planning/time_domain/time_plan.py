@@ -383,16 +383,16 @@ def hold_torques(
         stretch = 1.0
         for _ in range(6):  # most durations; phase 3 of query 0 takes 5 at 5 ms
             solution = solve(stages, period, stretch, equal=False)
+            while solution.success and (shorter := drop_periods(solution.stages)):
+                fewer = held.solve(shorter, most=ITERATIONS)
+                if not fewer.success or fewer.cost > solution.cost:
+                    break
+                solution = fewer
+            solution = refine(held, solution) if solution.success else solution
             if solution.success:
-                break
+                return solution
             stretch += max(0.02, period / sum(stage.guess.duration for stage in stages))
-        while solution.success and (shorter := drop_periods(solution.stages)):
-            fewer = held.solve(shorter, most=ITERATIONS)
-            if not fewer.success or fewer.cost > solution.cost:
-                break
-            solution = fewer
-        solution = refine(held, solution) if solution.success else solution
-        return solution if solution.success else None
+        return None
 
     for share in (1.0, 0.5, 0.2):
         solution = hold(share * scene.control_period)
