@@ -213,7 +213,6 @@ def test_keys_are_checked_and_kept() -> None:
         ({"settle": "ten"}, "settle", "100 %"),
         ({"settle": "0 %"}, "settle", "100 %"),
         ({"settle_gap": 1.0}, "settle_gap", "allowed are"),
-        ({"settle": 0.01, "actuator_lag": 1e-3}, "settle", "actuator_lag"),
         ({"phases[1].settle": "x"}, "phases[1].settle", ">= 0"),
         ({"phases[1].settle": 0.01, "phases[1].end": "smooth"}, "phases[1].settle", "smooth"),
     ],
@@ -286,6 +285,23 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
     ahead = np.gradient(tau2, t) * 1e-3
     assert np.median(np.abs(command2 - tau2 - ahead)) < 1e-2 * np.abs(ahead).max()
     assert read_torque_csv(str(path)).duration == t[-1]
+
+
+@pytest.mark.parametrize("motors", [{"actuator_lag": 2e-3}, {"torque_rate_limit": 500.0}])
+def test_limited_torques_change_into_a_dwell_and_out_of_it(
+    heptagon: Problem, motors: dict[str, float]
+) -> None:
+    problem = heptagon.with_(motors | {"settle": 0.01})
+    plan = solve(problem, intervals=40)
+    torque, starts = plan.trajectory.torque, plan.trajectory.phase_starts
+    # Neither steps, rates nor commands beyond the limits, and the replay reaches the goal.
+    assert describe_motors(problem, torque) == []
+    assert verify(problem, plan).ok
+    # Each phase ends with the torques of its dwell, for as long as that lasts.
+    for phase, end in zip(plan.phases, starts[1:], strict=True):
+        assert phase.settling is not None and phase.settling.duration == 0.01
+        t = np.linspace(end - 0.01 + 1e-9, end - 1e-9, 5)
+        np.testing.assert_allclose(torque.at(t), [phase.settling.tau] * 5, rtol=1e-6)
 
 
 def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem, Plan]) -> None:

@@ -205,7 +205,8 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
     """
     if isinstance(motion := plan.motion, PausedMotion):
         torque = plan.torque.cut(motion.pause, float(plan.torque.breaks[-1]))
-        plan = plan._replace(motion=motion.motion, torque=TorqueProfile.chain([torque]))
+        torque = TorqueProfile(torque.breaks - motion.pause, torque.coefficients)
+        plan = plan._replace(motion=motion.motion, torque=torque)
     change = change_torques(formation.scene, before, plan.end_torques[0])
     # Other contacts than the phase's may help to hold the object until it moves.
     forces = np.full((2, formation.n_contacts), np.nan)

@@ -381,9 +381,6 @@ def check_problem(problem: Problem) -> None:
         field.check(value, field.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
-    if problem.scene.actuator_lag.any() and problem.is_settled:
-        text = "what holds an end may take all of a torque limit: with actuator_lag allowed is 0"
-        raise InputError("", "settle", text)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"

@@ -369,10 +369,15 @@ def hold_torques(
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
 
     def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
-        return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=ITERATIONS)
+        most = 150 if equal else ITERATIONS  # phases 2 to 4 of a pentagon take 70 at 2 ms
+        return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=most)
 
     def hold(period: float) -> TimeSolution | None:
         stages = free
+        if sum(count_periods(free, period)) > 100:
+            # A plan with periods twice as long is one with these: 2 to 4 of a pentagon at 1 ms.
+            coarse = hold(2 * period)
+            stages = coarse.stages if coarse else free
         for _ in range(4):  # most times that numbers of periods change
             solution = solve(stages, period, 1.0, equal=True)
             if not solution.success:
