@@ -338,7 +338,8 @@ class Stopped:
 def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     def build(shape: LimitShape, intervals: int, goal: Objective) -> PathNLP:
         nlp = build_path_nlp(shape, intervals, goal)
-        return replace(nlp, solver=Stopped(nlp.solver.function)) if goal is Objective.TIME else nlp
+        stopped = Stopped(nlp.solver.function)
+        return replace(nlp, solver=stopped, starter=stopped) if goal is Objective.TIME else nlp
 
     monkeypatch.setattr(path_plan, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):

@@ -39,7 +39,7 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import SweepMode
-from ..nlp import Columns, Solver, SolverStatistics, book, build_solver
+from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective
 from .path_data import PhaseData
 from .path_mesh import Fastest
@@ -233,8 +233,8 @@ class PathNLP:
     """A built NLP."""
 
     # both take x0, p, bounds and multipliers; see `build_path_nlp` for their order
-    solver: Solver
-    starter: Solver  # for points that are no solution, with slacks near the central path
+    solver: Expression
+    starter: Expression  # for points that are no solution, with slacks near the central path
     shape: LimitShape
     intervals: int
     objective: Objective
