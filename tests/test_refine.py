@@ -1,12 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import pytest
 
 from wholearm import SolverError
-from wholearm.planning.path_domain.path_plan import SOLVES, PathIterate, refine
+from wholearm.planning.refinement import SOLVES, refine
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,7 @@ class Halving:
 
 
 def refined(accuracy: float, **changes: int) -> Halving:
-    first: Any = Halving(**changes)
-    return cast(Halving, refine(cast(PathIterate, first), accuracy))
+    return refine(Halving(**changes), accuracy)
 
 
 def test_refinement_ends_below_the_accuracy_without_violations() -> None:

@@ -1,10 +1,10 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-Direct collocation along the curve (`path_nlp`) in one loop: solve, check between nodes, adapt,
-solve again (`refine`). Elements end where the plan switches from one active limit to another: first
-where the minimum-time sweep does, then where the solution does. They are halved while violations
-between nodes cost more than the accuracy. Limits are tightened by their violations until none
-exceeds `MISS`; what that costs is the estimate of the error.
+Direct collocation along the curve (`path_nlp`), refined in the loop of `refinement`. Elements end
+where the plan switches from one active limit to another: first where the minimum-time sweep does,
+then where the solution does. They are halved while violations between nodes cost more than the
+accuracy. Limits are tightened by their violations until none exceeds `MISS`; what that costs is the
+estimate of the error.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
+from ..refinement import SOLVES, refine
 from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
-SOLVES = 40  # most of one refinement
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
@@ -164,41 +164,6 @@ def plan_task(task: Task, insist: bool = True) -> PathIterate:
         other = refine(replace(first, task=replace(task, options=options)), accuracy)
         iterate = min(iterate, other, key=lambda candidate: candidate.objective)
     return iterate
-
-
-def refine(first: PathIterate, accuracy: float) -> PathIterate:
-    """The solution without violations whose estimated error is below the accuracy, or least.
-
-    Each solve starts from the last solution. After it limits are checked once between the nodes.
-
-    Raises
-    ------
-    SolverError  if no solution keeps the limits between nodes; it is that of the first mesh
-    """
-    iterate: PathIterate | None = first
-    best: PathIterate | None = None
-    failure: SolverError | None = None
-    for _ in range(SOLVES):
-        if iterate is None:
-            break
-        try:
-            iterate = iterate.solve()
-        except SolverError as error:
-            failure = failure or error
-            if best is not None:
-                return best
-            iterate = iterate.restart()
-            continue
-        if iterate.violation <= 1 and (best is None or iterate.error < best.error):
-            best = iterate
-            if best.error <= accuracy:
-                return best
-        iterate = iterate.adapt()
-    if best is None:
-        raise failure or SolverError(
-            "limits are still missed between nodes after all solves; plan with more intervals"
-        )
-    return best
 
 
 def _plan_within(task: Task) -> PathIterate:

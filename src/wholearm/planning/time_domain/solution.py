@@ -13,6 +13,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
-from ...common.errors import Parameter
+from ...common.errors import Parameter, SolverError
 from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
@@ -28,6 +29,7 @@ from ...mechanics.sensitivity import find_slopes_at
 from ...problem.definition import Problem
 from ...results.trajectory import Samples
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
+from ..refinement import CostlyError, refine
 from ..robust.robust_rows import find_edges
 from .stage import (
     LimitMisses,
@@ -306,53 +308,144 @@ class CheckPlaces(NamedTuple):
     limits: Array  # (K checks, n_limits) [m]: values of every limit of the formation
 
 
-def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """Refine a solution until it is accurate and keeps limits between points."""
-    refined, coarse, failed = 0, math.nan, False
-    highest = solution.cost + SETTINGS.increase * search.measure(solution.cost)
-    raised = [LimitMisses.none(stage) for stage in solution.stages]
-    depth = SETTINGS.graze * search.problem.scene.scales.length
-    for _ in range(SETTINGS.iterates):
-        motions = make_motions(solution.stages, search.scheme)
-        checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
-        misses = [
-            find_misses(stage, check, search.problem.epsilon, solution.margin)
-            for stage, check in zip(solution.stages, checks, strict=True)
-        ]
-        over = [measure_misses(miss) for miss in misses]
-        lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in checks]
-        stages = monitor(solution.stages, lowest, depth)
-        gains = _find_gains(search, solution, motions, coarse)
-        times = [np.zeros(stage.intervals, dtype=np.int64) for stage in stages]
-        if failed:
-            # Raised limits may leave nothing where shorter intervals miss less.
-            times = [(ratios > 1).astype(np.int64) for ratios in over]
-        elif refined < SETTINGS.refinements:
-            times = _choose_halvings(search, solution, motions, misses, gains) or times
-        worst, finer = (
-            max(ratios.max() for ratios in over),
-            any(halvings.any() for halvings in times),
+@dataclass(frozen=True)
+class TimeIterate:
+    """Stages with the solution on them, or the one before to start from; see `refinement`."""
+
+    search: TimeSearch
+    solution: TimeSolution
+    stages: list[Stage]
+    raised: list[LimitMisses]  # limits of the stages, by these amounts
+    highest: float  # cost above which refinement ends
+    is_solved: bool = True
+    coarse: float = math.nan  # cost of the solution before
+    refined: int = 0  # iterates with finer intervals so far
+    before: TimeIterate | None = None  # the last one with a solution
+
+    def solve(self) -> TimeIterate:
+        """The solution on these stages."""
+        if self.is_solved:
+            return self
+        most = SETTINGS.patience * (2 if self.search.problem.scene.has_slow_motors else 1)
+        solution = self.search.solve(self.stages, self.solution, most, self.raised)
+        if not solution.success:
+            raise SolverError(solution.status)
+        if solution.cost > self.highest:
+            raise CostlyError(COSTLY)
+        return replace(
+            self,
+            solution=solution,
+            stages=solution.stages,
+            is_solved=True,
+            coarse=self.solution.cost,
+            before=None,
         )
-        if worst <= 1 and not finer and stages is solution.stages:
-            return solution._replace(error=_sum(gains))
-        refined += finer
-        raised = [
-            amounts.add(miss, SETTINGS.over).halve(mine)
-            for amounts, miss, mine in zip(raised, misses, times, strict=True)
-        ]
-        stages = bisect_intervals(stages, search.scheme, times)
-        most = SETTINGS.patience * (2 if search.problem.scene.has_slow_motors else 1)
-        better = search.solve(stages, solution, most, raised)
-        if better.success and better.cost > highest:
-            return better._replace(status=COSTLY, success=False)
-        if better.success:
-            coarse, solution, failed = solution.cost, better, False
-            continue
-        if failed:
-            return better
-        raised, failed = [LimitMisses.none(stage) for stage in solution.stages], True
-    status = f"limits are still missed {worst:.2g} times what is allowed between points"
-    return solution._replace(status=status, success=False)
+
+    def adapt(self) -> TimeIterate | None:
+        """With finer intervals, raised limits and those of the formation that are violated."""
+        if self.violation <= 1 and not self.is_coarse:
+            return None
+        return self._bisect(self.halvings, self.raised)
+
+    def restart(self) -> TimeIterate | None:
+        """From the last solution, without raised limits; once.
+
+        These may leave nothing where shorter intervals miss less.
+        """
+        if self.before is None:
+            return None
+        times = [(ratios > 1).astype(np.int64) for ratios in self.before.over]
+        none = [LimitMisses.none(stage) for stage in self.before.stages]
+        return replace(self.before._bisect(times, none), before=None)
+
+    def _bisect(
+        self, times: Sequence[NDArray[np.int64]], raised: Sequence[LimitMisses]
+    ) -> TimeIterate:
+        """On intervals that are halved so many times, with limits raised by what is missed."""
+        return replace(
+            self,
+            stages=bisect_intervals(self.monitored, self.search.scheme, times),
+            raised=[
+                amounts.add(miss, SETTINGS.over).halve(mine)
+                for amounts, miss, mine in zip(raised, self.misses, times, strict=True)
+            ],
+            is_solved=False,
+            refined=self.refined + any(halvings.any() for halvings in times),
+            before=self,
+        )
+
+    @cached_property
+    def motions(self) -> list[StageMotion]:
+        """The motion of each stage that its torques lead to."""
+        return make_motions(self.stages, self.search.scheme)
+
+    @cached_property
+    def checks(self) -> list[CheckPlaces]:
+        """Each stage between its points."""
+        return [check_between(*pair) for pair in zip(self.stages, self.motions, strict=True)]
+
+    @cached_property
+    def misses(self) -> list[LimitMisses]:
+        """Misses of limits of each stage."""
+        epsilon, margin = self.search.problem.epsilon, self.solution.margin
+        pairs = zip(self.stages, self.checks, strict=True)
+        return [find_misses(stage, check, epsilon, margin) for stage, check in pairs]
+
+    @cached_property
+    def over(self) -> list[Array]:
+        """The largest miss of each interval of each stage, over its tolerance."""
+        return [measure_misses(miss) for miss in self.misses]
+
+    @cached_property
+    def monitored(self) -> list[Stage]:
+        """The stages with limits of their formations that are violated between points."""
+        lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in self.checks]
+        return monitor(
+            self.stages, lowest, SETTINGS.graze * self.search.problem.scene.scales.length
+        )
+
+    @cached_property
+    def gains(self) -> list[Array]:
+        """Relative gain of torques of any shape in each interval of each stage."""
+        return _find_gains(self.search, self.solution, self.motions, self.coarse)
+
+    @cached_property
+    def halvings(self) -> list[NDArray[np.int64]]:
+        """How often to halve each interval of each stage."""
+        times = list[NDArray[np.int64]]()
+        if self.refined < SETTINGS.refinements:
+            args = self.search, self.solution, self.motions, self.misses, self.gains
+            times = _choose_halvings(*args)
+        return times or [np.zeros(stage.intervals, dtype=np.int64) for stage in self.stages]
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether any interval is to be halved."""
+        return any(times.any() for times in self.halvings)
+
+    @property
+    def violation(self) -> float:
+        """The largest miss, over its tolerance; infinite where the NLP lacks a limit."""
+        if self.monitored is not self.stages:
+            return math.inf
+        return float(max(ratios.max() for ratios in self.over))
+
+    @property
+    def error(self) -> float:
+        """Estimated relative gain of better torques; infinite on intervals that are too long."""
+        return math.inf if self.is_coarse else _sum(self.gains)
+
+
+def refine_stages(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
+    """Refine a solution until it is accurate and keeps limits between points."""
+    raised = [LimitMisses.none(stage) for stage in solution.stages]
+    highest = solution.cost + SETTINGS.increase * search.measure(solution.cost)
+    first = TimeIterate(search, solution, solution.stages, raised, highest)
+    try:
+        best = refine(first, solves=SETTINGS.iterates)
+    except SolverError as error:
+        return solution._replace(status=str(error), success=False)
+    return best.solution._replace(error=_sum(best.gains))
 
 
 def keep_within(search: TimeSearch, solution: TimeSolution) -> TimeSolution:

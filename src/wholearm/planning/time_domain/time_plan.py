@@ -40,7 +40,7 @@ from .mode_search import (
     list_neighbours,
     sign_sequence,
 )
-from .solution import COSTLY, Price, TimeSearch, TimeSolution, keep_within, refine
+from .solution import COSTLY, Price, TimeSearch, TimeSolution, keep_within, refine_stages
 from .stage import (
     Scheme,
     Stage,
@@ -209,13 +209,13 @@ def reach_motors(
             if not reaches(max(1.0, plans[-1][0] / step)):
                 step = math.sqrt(step)
     if plans and plans[-1][0] == 1:
-        solution = plans[-1][2] if search.only_begins else refine(search, plans[-1][2])
+        solution = plans[-1][2] if search.only_begins else refine_stages(search, plans[-1][2])
         if solution.success:
             return solution
         reaches(4.0)
     for factor, quick, solution in sorted(plans, key=lambda plan: plan[0]):
         rough = replace(quick, options=quick.options.roughen())
-        if factor > 1 and refine(rough, solution).success:
+        if factor > 1 and refine_stages(rough, solution).success:
             break
     else:
         factor = math.inf
@@ -329,19 +329,19 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     if search.only_begins:
         return searched
     search, coarse = choose_end(search, searched)
-    refined = refine(search, coarse)
+    refined = refine_stages(search, coarse)
     if not refined.success and search.options.mode_search and refined.status != COSTLY:
         # Phase 2 of the route of query 10 has no solution in which a contact turns back without
         # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
         # search leads.
         others = chain(_list_as_good(search, coarse), [solution] * (searched is not solution))
-        solutions = (refine(search, other) for other in others)
+        solutions = (refine_stages(search, other) for other in others)
         refined = next((solution for solution in solutions if solution.success), refined)
     solution = refined
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
-        fewer = refine(search, fewer)
+        fewer = refine_stages(search, fewer)
         if fewer.success and fewer.cost - solution.cost < WORTH * abs(solution.cost):
             solution = fewer
     if solution.success and search.options.ranges:
@@ -393,7 +393,7 @@ def hold_torques(
                 if not fewer.success or fewer.cost > solution.cost:
                     break
                 solution = fewer
-            solution = refine(held, solution) if solution.success else solution
+            solution = refine_stages(held, solution) if solution.success else solution
             if solution.success:
                 return solution
             stretch += max(0.02, period / sum(stage.guess.duration for stage in stages))

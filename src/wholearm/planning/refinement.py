@@ -1,0 +1,81 @@
+"""Refinement of the solution of a transcription: solve, check between nodes, adapt, solve again.
+
+Both transcriptions (`path_domain.path_plan`, `time_domain.solution`) are refined by this loop. Each
+solve starts from the last solution. After it limits are checked once between the nodes; then the
+mesh is adapted, or limits are tightened by their violations.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, Self, TypeVar
+
+from ..common.errors import SolverError
+
+SOLVES = 40  # most of one refinement
+
+
+class CostlyError(SolverError):
+    """A solution costs so much more than the first one that further ones are of no use."""
+
+
+class Iterate(Protocol):
+    """A mesh of a transcription, with the solution on it or the point to start from."""
+
+    @property
+    def violation(self) -> float:
+        """The largest violation of limits between nodes, over the allowed one."""
+
+    @property
+    def error(self) -> float:
+        """Estimated relative error of the objective."""
+
+    def solve(self) -> Self:
+        """The solution on this mesh; SolverError without one."""
+
+    def adapt(self) -> Self | None:
+        """The next one to solve, on another mesh or with tighter limits; None if nothing is due."""
+
+    def restart(self) -> Self | None:
+        """The next one to solve where this has no solution; None without one."""
+
+
+I = TypeVar("I", bound=Iterate)  # noqa: E741
+
+
+def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
+    """The solution without violations whose estimated error is below the accuracy, or least.
+
+    Raises
+    ------
+    SolverError  if no solution keeps the limits between nodes; it is that of the first mesh, or a
+                 CostlyError
+    """
+    iterate: I | None = first
+    best: I | None = None
+    failure: SolverError | None = None
+    violation = float("inf")
+    for _ in range(solves):
+        if iterate is None:
+            break
+        try:
+            iterate = iterate.solve()
+        except CostlyError:
+            raise
+        except SolverError as error:
+            failure = failure or error
+            if best is not None:
+                return best
+            iterate = iterate.restart()
+            continue
+        violation = iterate.violation
+        if violation <= 1 and (best is None or iterate.error <= best.error):
+            best = iterate
+            if best.error <= accuracy:
+                return best
+        iterate = iterate.adapt()
+    if best is None:
+        raise failure or SolverError(
+            f"limits are still missed {violation:.2g} times what is allowed between nodes after "
+            "all solves; plan with more intervals"
+        )
+    return best
