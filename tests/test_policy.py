@@ -17,13 +17,13 @@ from scipy.optimize import linprog
 
 import wholearm
 from scenes import PENTAGON
-from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
+from shipped import HEPTAGON, HEXAGON, IMPACTS, LANDING, plan_of, problem_of
 from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajectory, Uncertainty
 from wholearm.analysis.robustness import make_trial
 from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
+from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
     find_widest,
     find_within,
@@ -32,11 +32,19 @@ from wholearm.policy.make import (
     retime,
     retime_within,
 )
-from wholearm.policy.regulator import RATE, SAME, Linear, hold_end, regulate, tabulate_motion
+from wholearm.policy.regulator import (
+    DAMPING,
+    RATE,
+    SAME,
+    Linear,
+    hold_end,
+    regulate,
+    tabulate_motion,
+)
 from wholearm.problem.read import build_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.simulation.simulate import simulate_free
-from wholearm.verification.free import find_losses, verify_policy
+from wholearm.verification.free import find_losses, list_aliases, verify_policy
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +84,12 @@ def test_limits_that_the_squeeze_does_not_change_leave_it_where_it_is(policy: Po
         limits = [*base.tolist(), level - 1.0], [0.0] * 9, [*press.tolist(), 0.0]
         assert choose_internal_force(*limits, 0.0) == (level - 1.0, squeeze)
     # A coefficient that is 0 but for rounding counts as 0.
-    tables = dict(policy.tables[0])
-    arrivals = []
+    tables, levels = dict(policy.tables[0]), []
     for rounding in (0.0, 5e-15, -2e-17):
-        tables["arrival"] = np.array([[1.0, 0, 0, 0, rounding], [1.0, 0, 0, 0, 2.0]])
-        arrivals.append(CurveLaw(tables, policy.settings).arrival)
-    assert arrivals[0] == arrivals[1] == arrivals[2]
+        tables["levels"] = policy.tables[0]["levels"].copy()
+        tables["levels"][0, 0, 0, 4] = rounding
+        levels.append(CurveLaw(tables, policy.settings).levels)
+    assert levels[0] == levels[1] == levels[2]
 
 
 def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
@@ -145,15 +153,75 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
     rng = np.random.default_rng(6)
     A, B = np.zeros((4, 4)), rng.normal(size=(2, 2))
     A[:2, 2:], A[2:] = np.eye(2), rng.normal(size=(2, 4))
-    cost, joints = np.diag([1.0, 2.0]), np.eye(2)
+    cost, N = np.diag([1.0, 2.0]), np.vstack([np.zeros((3, 2)), np.eye(2)])
     step = 1e-4
-    gains = regulate([Linear(joints, A, B, cost)] * 50, step)
+    gains = regulate([Linear([3, 4], N, np.eye(2), A, B, cost)] * 50, step) * (1 + DAMPING**2)
     inputs, Q = np.vstack([np.zeros((2, 2)), B]), np.diag([RATE**4] * 2 + [2 * RATE**2] * 2)
     P = solve_continuous_are(A, inputs, Q, cost)
     best = np.linalg.solve(cost, inputs.T @ P)
     # Torques are held for a step.
     assert gains[0] == pytest.approx(best, rel=0.1)
     assert np.linalg.eigvals(A - inputs @ gains[0]).real.max() < -0.3 * RATE
+
+
+def test_joints_that_hardly_move_with_the_object_cause_no_large_torques() -> None:
+    rng = np.random.default_rng(7)
+    A, B = np.zeros((4, 4)), rng.normal(size=(2, 2))
+    A[:2, 2:], A[2:] = np.eye(2), rng.normal(size=(2, 4))
+
+    def find_gains(seen: float) -> np.ndarray:
+        # The joints move as (1, 0) and `seen` times (0, 1).
+        N = np.vstack([np.eye(3, 2), np.diag([1.0, seen])])
+        return np.asarray(regulate([Linear([0, 1], N, np.eye(2), A, B, np.eye(2))] * 2, 1e-4)[0])
+
+    whole, none, little = (find_gains(seen) for seen in (1.0, 0.0, 1e-3))
+    assert np.abs(none[:, [1, 3]]).max() < 1e-9 * np.abs(whole).max()
+    assert np.abs(little).max() < 1.01 * np.abs(whole).max()
+    assert little[:, [0, 2]] == pytest.approx(whole[:, [0, 2]], rel=1e-6)
+
+
+def test_speeds_along_a_curve_are_right_between_and_at_its_nodes(policy: Policy) -> None:
+    # Joint angles (s, s^2) at a speed of 1: chords alone are 5 % off at their ends.
+    s = np.linspace(0.0, 1.0, 11)
+    tables = dict(policy.tables[0])
+    tables |= {"s": s, "theta": np.column_stack([s, s**2]), "b": np.ones(11)}
+    tables |= {name: tables[name][:10] for name in ("levels", "torque", "forces")}
+    law = CurveLaw(tables, policy.settings)
+    for place in (0.401, 0.45, 0.499):
+        law._measure(place, place**2, 1.0, 2 * place)
+        assert law.v == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_landing_goes_on_until_its_contact_stops_the_joints() -> None:
+    settings = LoopSettings(1e-3, 0.0, 1e-3, 1e-3, 5e-3, 1.0, (1.0, 1.0))
+    theta = np.linspace([0.0, 0.0], [0.01, 0.0], 11)
+    tables = {
+        "starts": np.zeros(1), "step": np.array([1e-3]), "theta": theta,
+        "rates": np.zeros((11, 2)), "tau": np.full((11, 2), 0.1),
+        "gain": np.tile(50 * np.eye(2, 4), (11, 1, 1)), "push": np.array([0.5, 0.5]),
+        "still": np.array([0.02]), "ways": np.array([[0.0, 1.0]]),
+        "approach": np.array([0.1, 0.0]),
+    }  # fmt: skip
+    law = MotionLaw(tables, settings)
+    angle, ends = np.zeros(2), 0.012  # the contact is 2 mrad beyond the end
+    for step in range(200):
+        beyond = min(max(1e-3 * (step - 10), 0.0) * 0.1, ends - 0.01)
+        angle[:] = 0.01 * min(step / 10, 1.0) + beyond, 0.0
+        speed = 0.1 if angle[0] < ends - 1e-9 else 0.0
+        torques = law.step(angle.tolist(), [speed, 0.0], None)
+        if law.over:
+            break
+        assert law.pushes <= (angle[0] > ends - 1e-9)
+    # It is held with the torques that press, without a spring across what the contact leaves free.
+    assert law.pushes and step < 80 and torques == pytest.approx((0.5, 0.5))
+
+
+def test_a_contact_presses_under_the_name_of_the_neighbour_that_it_goes_on_from() -> None:
+    own = problem_of(HEXAGON)
+    aliases = [list_aliases(own, own.phases[index]) for index in (8, 9, 10)]
+    assert aliases[1]["v4-tip1"] == {"e3-tip1", "v4-finger1"}
+    assert aliases[0]["e3-tip1"] == aliases[2]["v4-finger1"] == {"v4-tip1"}
+    assert not aliases[1]["v1-palm"]
 
 
 def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> None:

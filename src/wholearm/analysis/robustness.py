@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,7 +34,7 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
-from ..verification.free import MOMENT, REACHED, TURNED
+from ..verification.free import MOMENT, REACHED, TURNED, list_aliases
 
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
@@ -150,6 +150,7 @@ class TimeWindow(NamedTuple):
     contacts: tuple[str, ...]  # that it is planned with
     gained: str  # the contact that it ends with; empty where it ends otherwise
     start: float = 0.0  # [s]: of the first window
+    aliases: Mapping[str, set[str]] = {}  # as of `list_aliases`
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,8 +272,10 @@ class Trial:
             times = (event.time for event in makes if event.contact == window.gained)
             made = min((time for time in times if time > began), default=gain)
             planned = window.stop + delay
+            stop = min(planned, gain, made)
             for name in window.contacts:
-                time, force = _find_loss(simulation, name, began, min(planned, gain, made), unit)
+                aliases = window.aliases.get(name, ())
+                time, force = _find_loss(simulation, name, aliases, began, stop, unit)
                 least = min(least, force)
                 if time is not None:
                     losses.append((time, window.phase, name))
@@ -289,7 +292,12 @@ class Trial:
 
 
 def _find_loss(
-    simulation: FreeSimulation, name: str, start: float, stop: float, unit: float
+    simulation: FreeSimulation,
+    name: str,
+    aliases: Collection[str],
+    start: float,
+    stop: float,
+    unit: float,
 ) -> tuple[float | None, float]:
     """When a contact opens for longer than 1e-3 units of time, if it does; and its least c_n.
 
@@ -300,7 +308,7 @@ def _find_loss(
     here = (t >= start) & (t < stop)
     forces = c_n[here & (c_n == c_n)]
     least = float(forces.min()) if len(forces) else math.inf
-    pauses = simulation.list_pauses(name, start, stop)
+    pauses = simulation.list_pauses(name, start, stop, aliases)
     if pauses and pauses[0][0] <= start:
         pauses = [pause for pause in pauses if pause[1] > start + MOMENT * unit]
     return next((first for first, after in pauses if after - first > 1e-3 * unit), None), least
@@ -341,6 +349,7 @@ def make_trial(
             float(starts[planned_phase.index + 1]) - begin,
             tuple(planned_phase.formation.names),
             "" if planned_phase.until.contact is None else planned_phase.until.contact.name,
+            aliases=list_aliases(problem, planned_phase),
         )
         for planned_phase in problem.phases[first : last + 1]
     )

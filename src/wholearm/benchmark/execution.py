@@ -27,6 +27,7 @@ from ..planning.result import Plan
 from ..policy.make import make_policy
 from ..problem.definition import Problem
 from ..problem.read import build_problem
+from ..results.trajectory import Trajectory
 from ..search.find_route import find_route, forget_roadmaps
 from ..verification.free import verify_policy
 from .queries import DRAW
@@ -91,7 +92,7 @@ class Execution(Study):
                     printed = solve(build_problem(table | phases), objective)
                     part["off"] = printed.value / answer.plan.value - 1
                 elif way == "policy":
-                    policy = make_policy(printed.problem, printed.trajectory)
+                    policy = make_policy(printed.problem, printed.trajectory, planner=plan_anew)
                     report = verify_policy(printed.problem, printed.trajectory, policy)
                     part["why"] = "; ".join(report.failures)
                 else:
@@ -141,6 +142,11 @@ class Execution(Study):
             lines += ["", "Refused:", "", *refusals]
         wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
+
+
+def plan_anew(problem: Problem) -> Trajectory:
+    """What a policy plans anew, as the command `policy` does."""
+    return solve(problem, replay=False).trajectory
 
 
 def vary(problem: Problem, way: str) -> Problem:

@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from math import ceil, isfinite, sqrt
 from typing import Any, NamedTuple
 
+import numpy as np
+
 SAME = 1e-12  # difference of levels that counts as none
 
 
@@ -39,10 +41,7 @@ class LawSettings:
     # Level of limits below which feedback is reduced: absolute, and over that of the reference.
     # Case: phase 2 of heptagon_four_contacts, which loses v0-palm where braking begins.
     level: float = 1.5
-    part: float = 0.65
-    # Least level with the gained contact that changes the internal force. Case: arrival of phase 4
-    # of heptagon_four_contacts.
-    arrival: float = 0.3
+    part: float = 0.75
     last: float = 0.02  # last part of the curve, on which standing still counts as arrival
     near: float = 0.1  # last part of the curve in which an impact is expected
     late: float = 5.0  # periods after which an impact counts as over, if the joints do not show it
@@ -54,11 +53,12 @@ class LawSettings:
     drive: float = 0.3
     creep: float = 3.0  # dwell times after which joints may creep: with low friction they do
     # Distance beyond the end at which a contact counts as made although it has not stopped the
-    # joints, as time at touching speed [s]. Where the drive presses all contacts it is a tenth of a
-    # millimetre, which errors of geometry may be. Case: heptagon_four_contacts, phase 3. Where it
-    # opens some, the contact need not stop the joints. Case: a square that lands flush on the palm.
-    firm: float = 0.06
-    soon: float = 0.02
+    # joints, as time at touching speed [s]: 0.2 mm, as errors of geometry. Case: hexagon, phase 2.
+    beyond: float = 0.12
+    # Over time: periods of standing still after which a contact counts as made, and for how long
+    # the joints go on beyond the end [s]. Case: hexagon, phase 7, ends 0.3 mm before its contact.
+    stop: float = 10.0
+    reach: float = 0.1
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
     # reference force, over the mean of all.
     smooth: float = 0.3
@@ -79,7 +79,7 @@ class CurveLaw:
             nodes; `levels`, (n - 1, 2, m, 5), and `torque`, (n - 1, 2, 2, 5), at both ends of the
             intervals; `push`, (2,), final torques;
             `passes`, (1,): the end is passed at speed; `keeps`, (1,): `push` is held until the next
-            law begins; `arrival`, (k, 5), levels of all contacts at the end
+            law begins
 
     Attributes
     ----------
@@ -97,7 +97,6 @@ class CurveLaw:
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
         self.keeps = bool(tables.get("keeps", [0.0])[0])
-        self.arrival = _clear_rounding(tables["arrival"]).tolist()
         pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
         self.steps = [after - before for before, after in pairs]
         self.chords = [
@@ -105,12 +104,14 @@ class CurveLaw:
             for before, after in zip(self.theta, self.theta[1:], strict=False)
         ]
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
+        # Speeds by chords would step at nodes where joint angles bend. Case: hexagon, phase 5.
+        self.slopes = np.gradient(tables["theta"], tables["s"], axis=0).tolist()
         self.levels, self.level_rises = _split(tables["levels"], most=1e6)
         self.torque, self.torque_rises = _split(tables["torque"])
         self.floor = self._find_floor()
         self.gain = LAW.gain / (settings.period + settings.delay)
         self.memory = LAW.integral * self.gain**2 * settings.period
-        self.beyond = (LAW.firm if self._is_firm() else LAW.soon) * settings.touch
+        self.beyond = LAW.beyond * settings.touch
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
         self.brake: CurveLaw | None = None
@@ -230,9 +231,10 @@ class CurveLaw:
                 j, sign = j - 1, -1
             else:
                 break
-        h = self.steps[j]
-        self.j, self.s = j, self.nodes[j] + share * h
-        self.v = (rate_one * e + rate_two * f) / square * h
+        self.j, self.s = j, self.nodes[j] + share * self.steps[j]
+        (e, f), (g, h), share = self.slopes[j], self.slopes[j + 1], min(max(share, 0.0), 1.0)
+        e, f = e + share * (g - e), f + share * (h - f)
+        self.v = (rate_one * e + rate_two * f) / (e * e + f * f or 1e-30)
         while self.passed + 1 < self.count and self.s >= self.starts[self.passed + 1]:
             self.passed += 1
 
@@ -259,22 +261,6 @@ class CurveLaw:
         """The reference's b at a place near interval `j`."""
         j, share = self._locate(j, s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
-
-    def _is_firm(self) -> bool:
-        """Whether the drive presses all contacts at the end, with the gained one."""
-        touch, drive = self.settings.touch, 0.5 * LAW.drive * self.settings.most
-        levels = self._list_levels(len(self.steps) - 1, 1.0, touch)
-        self._add_arrival(touch, *levels)
-        return bool(self.arrival) and choose_internal_force(*levels, drive)[0] > LAW.arrival
-
-    def _add_arrival(
-        self, v: float, base: list[float], rates: list[float], press: list[float]
-    ) -> None:
-        """Add levels of all contacts at the end to those of a place."""
-        for c, cb, cv, ca, cl in self.arrival:
-            base.append(c + cb * v * v + cv * v)
-            rates.append(ca)
-            press.append(cl)
 
     def _find_floor(self) -> list[float]:
         """Level on each interval below which feedback is reduced."""
@@ -306,7 +292,7 @@ class CurveLaw:
     def _act(
         self, j: int, share: float, v: float, planned: float, a: float, beyond: bool = False
     ) -> tuple[float, float]:
-        """Torques for an acceleration within limits; `beyond` the end with those of the arrival."""
+        """Torques for an acceleration within limits; `beyond` the end no forces are planned."""
         b = v * v
         base, rates, press = self._list_levels(j, share, v)
         level, internal = choose_internal_force(base, rates, press, a)
@@ -319,11 +305,6 @@ class CurveLaw:
                 level, internal = choose_internal_force(base, rates, press, a)
             elif safe > level:
                 a, level, internal = planned, safe, other
-        elif beyond:
-            self._add_arrival(v, base, rates, press)
-            both, other = choose_internal_force(base, rates, press, a)
-            if both > LAW.arrival:
-                level, internal = both, other
         self.a, self.level = a, level
         tau, low, high = list[tuple[float, float]](), -1e30, 1e30
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
@@ -402,12 +383,13 @@ class MotionLaw:
             `theta`, `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), on errors of angles and speeds, the
             last one to hold the end; `push`, (2,), torques there; `still`, (1,), joint speed that
             counts as none [rad/s]; `ways`, (f, 2), orthonormal basis of free joint displacements at
-            the end
+            the end; `approach`, (2,), joint speeds at which the contact is looked for beyond the
+            end, with the last of `tau` [rad/s]; zero if it is not
 
     Attributes
     ----------
-    over    whether the next phase may begin
-    passed  how many of the phases have been passed
+    over, pushes  whether the next phase may begin, and whether the contact has been made
+    passed        how many of the phases have been passed
     """
 
     passes = False
@@ -417,9 +399,11 @@ class MotionLaw:
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
         self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
         self.tau, self.gain = tables["tau"].tolist(), tables["gain"].tolist()
-        self.push = tuple(tables["push"].tolist())
+        self.push, self.approach = tables["push"].tolist(), tables["approach"].tolist()
         self.ways = tables["ways"].tolist()
         self.end = self.every * (len(self.theta) - 1)
+        # The next law, if along a curve: it presses its contacts before it begins.
+        self.after: CurveLaw | None = None
         self.begin()
 
     @property
@@ -431,8 +415,9 @@ class MotionLaw:
         """Start anew, at the beginning or at the end."""
         self.clock = self.end if at_end else 0.0
         self.passed = len(self.starts) - 1 if at_end else 0
-        self.over, self.rested = False, 0.0
-        self.settled, self.left = False, [0.0] * len(self.ways)
+        self.over = self.pushes = False
+        self.rested = self.held = 0.0
+        self.left = [0.0] * len(self.ways)
 
     def step(
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
@@ -440,15 +425,22 @@ class MotionLaw:
         """Torques for joint angles and speeds [N m]."""
         settings, now = self.settings, self.clock
         self.clock = now + settings.period
+        lead = settings.delay + 0.5 * settings.period
         last = self.passed + 1
-        if last < len(self.starts) and now >= self.starts[last] - 0.5 * settings.period:
+        # A phase begins with its torques: these are interpolated.
+        if last < len(self.starts) and now + lead + self.every >= self.starts[last]:
             self.passed = last
         if now >= self.end:
             stands = max(abs(rates[0]), abs(rates[1])) < self.still
+            self.held += settings.period if self.pushes else 0.0
+            stands = stands or self.held > LAW.creep * settings.dwell
             self.rested = self.rested + settings.period if stands else 0.0
-            self.over = self.rested > settings.dwell + settings.delay
-            self.settled = self.settled or self.over
-        lead = settings.delay + 0.5 * settings.period
+            made = self.rested > LAW.stop * settings.period or not any(self.approach)
+            if made and not self.pushes:
+                self.pushes, self.rested = True, 0.0
+            self.over = self.pushes and self.rested > settings.dwell + settings.delay
+            if self.pushes and self.after is not None:
+                return self.after.hold(theta, rates)
         k, share = self._locate(now)
         (p, q), (u, w) = self.theta[k], self.theta[k + 1]
         (f, g), (c, d) = self.rates[k], self.rates[k + 1]
@@ -458,12 +450,15 @@ class MotionLaw:
         two = theta[1] - q - share * (w - q) + lead * fast_two
         k, share = self._locate(now + lead)
         torques = []
-        if self.settled:
-            one, two = self._add_integral(one, two)
+        beyond = min(max(now - self.end, 0.0), LAW.reach)
+        if self.pushes:
+            one, two = self._hold(one, two)
+        else:
+            one, two = one - beyond * self.approach[0], two - beyond * self.approach[1]
         for row in (0, 1):
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
-                first = after = self.push[row]
+                first = after = (self.push if self.pushes else self.tau[-1])[row]
             a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
             most = settings.limit[row]
@@ -472,15 +467,18 @@ class MotionLaw:
             torques.append(min(max(tau, -most), most))
         return torques[0], torques[1]
 
-    def _add_integral(self, one: float, two: float) -> tuple[float, float]:
-        """Angle errors along free displacements, plus their integrals."""
-        found_one = found_two = 0.0
+    def _hold(self, one: float, two: float) -> tuple[float, float]:
+        """Angle errors at the end, once at rest plus integrals along free displacements.
+
+        Where the contact was looked for, those across free displacements are errors of geometry.
+        """
+        free_one, free_two = (0.0, 0.0) if any(self.approach) else (one, two)
         for k, (p, q) in enumerate(self.ways):
             off = p * one + q * two
-            self.left[k] += 30.0 * self.settings.period * off
-            found_one += p * (off + self.left[k])
-            found_two += q * (off + self.left[k])
-        return found_one, found_two
+            self.left[k] += 30.0 * self.settings.period * off if self.over else 0.0
+            off = self.left[k] + (off if any(self.approach) else 0.0)
+            free_one, free_two = free_one + p * off, free_two + q * off
+        return free_one, free_two
 
     def _locate(self, t: float) -> tuple[int, float]:
         """Sample before a time, and the share of the interval after it."""

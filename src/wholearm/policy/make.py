@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
-from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..geometry.tracing import runs_on_curves, split_blocks, trace_phase
@@ -33,7 +32,6 @@ from ..mechanics.dynamics import (
     Directions,
     PathForces,
     V,
-    force_rows,
     inverse,
     metric_weights,
     stack_motion,
@@ -110,7 +108,6 @@ class CurveLimitRows(NamedTuple):
     slack: Array
     unit: Array  # (n, m) [N, N m]: margin at level 1
     presses: int  # how many of the m are of forces
-    scenes: tuple[Scene, ...]  # in the corners of the ranges
 
     @property
     def levels(self) -> Array:
@@ -177,7 +174,7 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     unit.append(np.tile(SETTINGS.spare * joint.scales[joint.sides[0]], (len(s), 1)))
     table, count = np.concatenate(slack, axis=1), 2 * slack[0].shape[1]
     units = np.concatenate(unit, axis=1)
-    return CurveLimitRows(s, torque, table, units, count, (formation.scene,))
+    return CurveLimitRows(s, torque, table, units, count)
 
 
 def have_same_signs(before: Directions, after: Directions) -> Array:
@@ -304,7 +301,6 @@ class Within(NamedTuple):
     sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
     same: Array  # (n,): where these are equal
     unit: Array  # (m + l,): margins at level 1, of forces and torques
-    scenes: tuple[Scene, ...]  # in the corners of the ranges
 
     def at(self, motion: PathMotion) -> tuple[CurveLimitRows, Array, Array]:
         """The law's limits near a motion; those of the reference, and their margins."""
@@ -316,7 +312,7 @@ class Within(NamedTuple):
         copies = forces.shape[1] // count
         unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
         table, presses = np.tile(unit, (n, 1)), forces.shape[1]
-        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.scenes)
+        rows = CurveLimitRows(self.s, self.torque, slack, table, presses)
         kept = np.concatenate(
             [SETTINGS.kept * self.unit[:count], SETTINGS.authority * self.unit[count:]]
         )
@@ -360,9 +356,8 @@ def find_within(
     left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
     scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
     unit = np.concatenate([np.maximum(SETTINGS.least * scales, least), SETTINGS.spare * most])
-    scenes = list_scenes(formation.scene, widths)
     same = have_same_signs(*sides)
-    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, scenes)
+    return Within(s, nominal, left, (corners[0], corners[1]), same, unit)
 
 
 class ReferencePiece(NamedTuple):
@@ -584,10 +579,8 @@ def _follow(
 
 def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
-    rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
-    arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
-    if contact is not None and not piece.passes:
-        arrival = find_arrival(piece.curve, contact, rows)
+    rows, levels = piece.rows, piece.rows.levels
+    dry = phase.formation.scene.dry[3:]
     return {
         "starts": np.zeros(1),
         "s": rows.s,
@@ -597,7 +590,6 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
         "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1)[..., COLUMNS],
         "push": push,
         "passes": np.array([piece.passes]),
-        "arrival": arrival[..., COLUMNS],
         # Friction of the joints decides on rest where torques are not much larger.
         "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
         "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
@@ -613,44 +605,6 @@ def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array
     joined["s"] = np.concatenate([one["s"], length + two["s"][1:]])
     joined["starts"] = np.concatenate([one["starts"], length + two["starts"]])
     return {**two, **joined}
-
-
-def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
-    """Levels of all contacts, with the gained one, at rest at the end of a curve, (k, 5).
-
-    Empty where forces at rest are not unique.
-    """
-    both, nominal_scene = curve.formation.add(gained), curve.formation.scene
-    if both.n_constraints != 5:
-        return np.zeros((0, 5))
-    # Torques have to balance with other friction, too, and in corners of the ranges.
-    cases = [(nominal_scene, factor) for factor in (0.7, 1.0, 1.2)]
-    cases += [(scene, 1.0) for scene in rows.scenes if scene != nominal_scene]
-    try:
-        balances = [_balance(curve, replace(both, scene=scene), mu) for scene, mu in cases]
-    except np.linalg.LinAlgError:
-        return np.zeros((0, 5))
-    margins, levels = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
-    for balance in balances:
-        forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
-        forces[:, ONE] += balance[: both.n_contacts, 0]
-        levels.append(forces / np.append(margins, margins.max())[:, None])
-    return np.vstack(levels)
-
-
-def _balance(curve: Curve, both: Formation, factor: float) -> Array:
-    """Constraint forces of (1, tau) at rest at the end of a curve, shape (5, 3)."""
-    scene, last = both.scene, curve.segments[-1]
-    point = curve.evaluate(np.array([curve.length]))
-    kinematics = both.evaluate(point.z, point.z_s)
-    slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
-    Xi = np.append(last.Xi, slides[-1])[None]
-    G = force_rows(both, kinematics, Directions(factor * Xi, last.sigma[None]))[0]
-    right = np.zeros((5, 3))
-    right[:, 0] = -scene.applied_force
-    right[3:, 0] += scene.dry[3:] * last.sigma
-    right[3:, 1:] = -np.eye(2)
-    return np.asarray(np.linalg.solve(G.T, right))
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -710,10 +664,10 @@ def make_policy(
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
-    blocks = split_blocks(problem)
-    starts = plan.phase_starts
+    starts, given, phases = plan.phase_starts, problem.table, problem.phases
     if reserve and planner is not None:
-        plan = replan(planner, problem, blocks, plan)
+        problem, plan = replan(planner, problem, plan)
+    blocks = split_blocks(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
     pieces = trace_pieces(problem, plan, reserve, widths)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
@@ -741,13 +695,15 @@ def make_policy(
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = bool(piece.passes) and phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            # The plan goes on in motion there.
+            entry["stops"] = phase.end is not phases[phase.index].end
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
             if not piece.passes:
                 entry["duration"] += settings.dwell + delay
         about += entries
     duration = sum(phase["duration"] for phase in about)
     whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
-    whole["problem"] = problem.table
+    whole["problem"] = given
     if ranges is not None and reserve:
         whole.update(ranges=dict(ranges), reserve=reserve)
     return Policy(tables, settings, whole)

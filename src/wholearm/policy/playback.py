@@ -19,16 +19,17 @@ from .curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing
 FORMAT = 1  # Version of the files
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,), "passes": (1,), "arrival": (-1, 5), "forces": (-1, 2, -1, 5),
+    "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
     "keeps": (1,), "starts": (-1,),
 }  # fmt: skip
 """Arrays of a phase along a curve and their shapes; -1 is any."""
 MOTION = {
     "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
     "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
+    "approach": (2,),
 }  # fmt: skip
 """Arrays of phases that are followed over time."""
-LATER = ("arrival", "ways", "forces", "keeps", "starts")
+LATER = ("ways", "forces", "keeps", "starts", "approach")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 Law = CurveLaw | MotionLaw
@@ -77,8 +78,10 @@ class Policy(Result):
             for arrays in self.tables
         )
         for law, after in pairwise(self.laws):
-            if isinstance(law, CurveLaw) and isinstance(after, CurveLaw):
+            if isinstance(after, CurveLaw) and isinstance(law, CurveLaw):
                 law.lead_to(after)
+            elif isinstance(after, CurveLaw):
+                law.after = after
         self.sensor = sensor
         self.last = len(self.laws) - 1 if laws is None else laws - 1
         counts = [law.count for law in self.laws[: self.last + 1]]
@@ -145,9 +148,10 @@ class Policy(Result):
 
     @property
     def resting(self) -> list[int]:
-        """Numbers of the phases that begin at rest."""
+        """Numbers of the phases that begin at rest, in the plan as well."""
+        stops = {entry["number"] for entry in self.about.get("phases", []) if entry.get("stops")}
         pairs = zip(self.firsts[1:], self.laws, strict=False)
-        return [1, *(first for first, before in pairs if not before.passes)]
+        return [1, *(k for k, before in pairs if not before.passes and k - 1 not in stops)]
 
     def reset(self, phase: int = 1) -> None:
         """Restart at a phase, at rest.

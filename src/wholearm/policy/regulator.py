@@ -1,17 +1,19 @@
 """Time-varying linear-quadratic regulator along phases with several degrees of freedom.
 
-Displacements N xi that the contacts leave free are seen by the joints as theta = Theta xi; N is
-scaled so that xi are the joint angles (two degrees of freedom), or their arc length (one). About
-the plan xi'' = A1 xi + A2 xi' + B tau. Torques are weighted by the accelerations and the relative
-contact forces that they cause; the Riccati equation is integrated backwards. Phases that leave the
-feedback no margin of forces and torques are planned anew with one.
+Displacements N xi that the contacts leave free are measured by the joints as theta = Theta xi; xi
+are the coordinates of z that determine them best. About the plan xi'' = A1 xi + A2 xi' + B tau.
+Displacements and accelerations are weighted by the metric of arc length, torques also by the
+relative contact forces that they cause; the Riccati equation is integrated backwards. The inverse
+of Theta is damped: where joints hardly move with the object, errors of geometry would pass for
+large displacements. Phases that leave the feedback no margin of forces and torques are planned anew
+with one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
 from ..common.sharing import Batch
 from ..contacts.formation import Formation
-from ..geometry.tracing import runs_on_curves
+from ..geometry.tracing import runs_on_curves, split_blocks
 from ..mechanics.dynamics import (
     LAMBDA,
     Directions,
@@ -29,25 +31,34 @@ from ..mechanics.dynamics import (
     inverse,
     metric_weights,
 )
-from ..problem.definition import ROWS, Phase, Problem
+from ..problem.definition import ROWS, End, Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
 from ..simulation.modes import Standstill, find_hold
 
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
+APPROACH = 4.0  # joint speed beyond the end, over that which counts as none
 STILL = 1e-3  # speed that counts as none, over the scene's
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
 SIGNS = {"+": 1.0, "-": -1.0, "rolls": 0.0}
 WORTH = 0.02  # angle error that is worth a whole torque limit in the cost [rad]
-ROOM = 0.1  # margin for feedback: normal force over the scene's unit, share of a torque limit
+DAMPING = 0.3  # of the inverse of Theta, which is 1 where the joints alone move. Case: heptagon
+# Margin for feedback: normal force over the scene's unit, share of a torque limit. Case: heptagon.
+PRESS, ROOM = 0.6, 0.1
+# Where a release has a place of the planner's choice, the policy stops for it, at such a share of
+# the way to the block's end, or does not stop, and keeps such a share of the margin: the first that
+# has a plan. Case: heptagon, where the released v3 touches finger 1 again.
+STOPS = ((0.8, 1.0), (0.5, 1.0), (None, 1.0), (None, 0.5), (None, 0.25))
 
 
 class Linear(NamedTuple):
     """Linearization of a plan at an instant."""
 
-    joints: Array  # (2, f): Theta
+    rows: list[int]  # of z: the coordinates xi
+    N: Array  # (5, f)
+    metric: Array  # (f, f): squared arc length of xi, 1 for a joint alone
     A: Array  # (2 f, 2 f)
     B: Array  # (f, 2)
     cost: Array  # (2, 2): of torques
@@ -80,7 +91,7 @@ def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
 
 def follow(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
-) -> tuple[float, Array, Array]:
+) -> tuple[float, Array, Array, bool]:
     """Squared speed over the plan's, torques and gains at even times in phases of a plan, (n,).
 
     The speed is that with the largest least margin of normal forces and torques.
@@ -89,13 +100,14 @@ def follow(
     -------
     b : float
     tau, gains : (n, 2) [N m] and (n, 2, 4)
+    slow : bool  whether the last torques press all contacts in a slow motion
     """
     starts, t = plan.phase_starts, end_within(phases, plan, t)
     owner = np.searchsorted(starts, t, side="right") - 1
     owner = owner.clip(phases[0].index, phases[-1].index)
     parts = [part for phase in phases for part in _divide(phase, plan, t[owner == phase.index])]
     scene = problem.scene
-    unit, limit = ROOM * scene.scales.force, scene.torque_limit
+    unit, limit = PRESS * scene.scales.force, scene.torque_limit
 
     def find_margin(b: float) -> float:
         forces = [part.find_forces(b)[:, : part.formation.n_contacts].min() for part in parts]
@@ -105,7 +117,11 @@ def follow(
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     tau = np.concatenate([part.find_torques(b) for part in parts])
-    return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b))
+    # Beyond the end the motion goes on slowly, where that presses all contacts.
+    slow = parts[-1].find_forces(0.0)[-1, : parts[-1].formation.n_contacts].min() > 0.0
+    if slow:
+        tau[-1] = parts[-1].find_torques(0.0)[-1]
+    return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b)), bool(slow)
 
 
 def _divide(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
@@ -161,74 +177,74 @@ def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linea
 
     def move(z: Array, v: Array, tau: Array) -> tuple[Array, Array]:
         acceleration, c, _ = forward(z, v, tau, Xi, sigma)
-        return acceleration[:, 3:, 0], c[:, : formation.n_contacts, 0]
+        return acceleration[..., 0], c[:, : formation.n_contacts, 0]
 
+    weights = metric_weights(formation.scene)
     N = _span(formation, kinematics.P)
-    joints = N[:, 3:]
-    back = np.linalg.pinv(joints)
-    speed = np.einsum("nfi,ni->nf", back, v[:, 3:])
-    rest, forces = move(z, v, tau)
     f = N.shape[2]
+    choices = [list(rows) for rows in combinations(range(5), f)]
+    rows = max(choices, key=lambda rows: np.abs(np.linalg.det(N[:, rows])).min())
+    N = N @ np.linalg.inv(N[:, rows])
+    metric = np.einsum("nif,i,nig->nfg", N, weights / weights[3], N)
+    speed = v[:, rows]
+    rest, forces = move(z, v, tau)
     A, B = np.zeros((n, 2 * f, 2 * f)), np.zeros((n, f, 2))
     A[:, :f, f:] = np.eye(f)
     press = np.zeros((n, formation.n_contacts, 2))
     for k in range(2):
         shifted, pressed = move(z, v, tau + np.eye(2)[k])
-        B[:, :, k] = np.einsum("nfi,ni->nf", back, shifted - rest)
+        B[:, :, k] = (shifted - rest)[:, rows]
         press[:, :, k] = pressed - forces
     for k in range(f):
         place = z + step * N[:, :, k]
         other = _span(formation, formation.evaluate(place, v).P)
-        other *= np.sign(np.einsum("nif,nif->nf", other, N))[:, None, :] if f == 1 else 1.0
+        other = other @ np.linalg.inv(other[:, rows])
         shifted, _ = move(place, np.einsum("nif,nf->ni", other, speed), tau)
-        A[:, f:, k] = np.einsum("nfi,ni->nf", back, shifted - rest) / step
+        A[:, f:, k] = (shifted - rest)[:, rows] / step
         rate = step / scales.time
         shifted, _ = move(z, v + rate * N[:, :, k], tau)
-        A[:, f:, f + k] = np.einsum("nfi,ni->nf", back, shifted - rest) / rate
+        A[:, f:, f + k] = (shifted - rest)[:, rows] / rate
     # Doubling a contact force, at least 0.05 units, costs as much as 0.1 units of acceleration.
     share = press / np.maximum(np.abs(forces), 0.05 * scales.force)[:, :, None]
     unit = 0.1 * scales.acceleration / scales.length
-    cost = B.transpose(0, 2, 1) @ B + unit**2 * share.transpose(0, 2, 1) @ share
+    cost = B.transpose(0, 2, 1) @ metric @ B + unit**2 * share.transpose(0, 2, 1) @ share
     cost += np.diag((RATE**2 * WORTH / problem.scene.torque_limit) ** 2)
-    return [Linear(*row) for row in zip(joints, A, B, cost, strict=True)]
+    return [Linear(rows, *arrays) for arrays in zip(N, metric, A, B, cost, strict=True)]
 
 
 def _span(formation: Formation, P: Array) -> Array:
-    """Basis of the null space of constraints, shape (n, 5, f), scaled by its joint angles."""
-    metric = np.sqrt(metric_weights(formation.scene))
-    free = 5 - P.shape[1]
-    N = np.linalg.svd(P / metric)[2][:, 5 - free :].transpose(0, 2, 1) / metric[:, None]
-    if free == 2:
-        return np.asarray(N @ np.linalg.inv(N[:, 3:]))
-    N = N / np.linalg.norm(N[:, 3:], axis=1, keepdims=True)
-    for k in range(1, len(N)):
-        N[k] *= np.sign((N[k, 3:] * N[k - 1, 3:]).sum()) or 1.0
-    return np.asarray(N)
+    """Basis of the null space of constraints, orthonormal in arc length, shape (n, 5, f)."""
+    lengths = np.sqrt(metric_weights(formation.scene))
+    free = np.linalg.svd(P / lengths)[2][:, P.shape[1] :]
+    return np.asarray(free.transpose(0, 2, 1) / lengths[:, None])
 
 
-def regulate(found: list[Linear], step: float) -> Array:
+def regulate(linearizations: list[Linear], step: float) -> Array:
     """Gains (n, 2, 4) by the discrete Riccati equation, integrated back from the end."""
-    from scipy.linalg import solve_continuous_are
+    from scipy.linalg import cholesky, solve_continuous_are
 
-    gains, P, shown = np.zeros((len(found), 2, 4)), np.zeros((0, 0)), np.zeros((2, 0))
-    for k in range(len(found) - 1, -1, -1):
-        linear = found[k]
-        f = linear.joints.shape[1]
-        Q = np.diag(np.repeat([RATE**4, 2 * RATE**2], f))
+    gains, P, after = np.zeros((len(linearizations), 2, 4)), np.zeros((0, 0)), list[int]()
+    for k in range(len(linearizations) - 1, -1, -1):
+        linear = linearizations[k]
+        N, f = linear.N, linear.N.shape[1]
+        Q = np.kron(np.diag([RATE**4, 2 * RATE**2]), linear.metric)
         inputs = np.vstack([np.zeros((f, 2)), linear.B])
         if not P.size:
             P = solve_continuous_are(linear.A, inputs, Q, linear.cost)
-        elif shown.shape[1] != f or (f == 1 and (shown * linear.joints).sum() < 0):
-            same = np.linalg.pinv(shown) @ linear.joints
-            turn = np.kron(np.eye(2), same)
+        elif after != linear.rows:
+            turn = np.kron(np.eye(2), N[after])
             P = turn.T @ P @ turn
-        shown = linear.joints
+        after = linear.rows
         rate = np.eye(2 * f) + step * linear.A + (step * linear.A) @ (step * linear.A) / 2
         drive = (step * np.eye(2 * f) + step**2 * linear.A / 2) @ inputs
         K = np.linalg.solve(step * linear.cost + drive.T @ P @ drive, drive.T @ P @ rate)
         P = step * Q + rate.T @ P @ (rate - drive @ K)
         P = (P + P.T) / 2
-        gains[k] = K @ np.kron(np.eye(2), np.linalg.pinv(linear.joints))
+        # In coordinates in which lengths are arc lengths.
+        unit = np.linalg.inv(cholesky(linear.metric))
+        Theta = N[3:] @ unit
+        inverse = unit @ Theta.T @ np.linalg.inv(Theta @ Theta.T + DAMPING**2 * np.eye(2))
+        gains[k] = K @ np.kron(np.eye(2), inverse)
     return gains
 
 
@@ -245,9 +261,16 @@ def tabulate_motion(
     inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
     # At the end each joint is critically damped, in contact or not.
     final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
-    b, tau, gains = follow(problem, phases, plan, t)
+    b, tau, gains, slow = follow(problem, phases, plan, t)
     speed = np.sqrt(b)
+    still = STILL * problem.scene.scales.rate
+    ways = _list_free_joints(problem, last, samples.z[-1:])
+    # Towards the contact, across what it leaves free.
+    heading = samples.z[-1, 3:] - samples.z[-2, 3:]
+    heading = heading - ways.T @ (ways @ heading)
+    size = np.linalg.norm(heading) if slow and last.until.contact is not None else 0.0
     return {
+        "approach": heading * (APPROACH * still / size if size else 0.0),
         "starts": (starts[:-1] - starts[0]) / speed,
         "step": np.array([(t[1] - t[0]) / speed]),
         "theta": samples.z[:, 3:],
@@ -255,8 +278,8 @@ def tabulate_motion(
         "tau": tau,
         "gain": np.concatenate([gains[:-1], final[None]]),
         "push": samples.tau[-1] if hold is None else hold,
-        "still": np.array([STILL * problem.scene.scales.rate]),
-        "ways": _list_free_joints(problem, last, samples.z[-1:]),
+        "still": np.array([still]),
+        "ways": ways,
     }
 
 
@@ -297,25 +320,48 @@ def list_phases(plan: Trajectory) -> list[PlannedPhase]:
     ]
 
 
-def replan(
-    planner: Planner, problem: Problem, blocks: Sequence[tuple[Phase, ...]], plan: Trajectory
-) -> Trajectory:
-    """A plan whose blocks off curves are replanned with a margin where possible."""
-    k, phases = 0, list[PlannedPhase]()
-    while k < len(blocks):
-        block, replacement = blocks[k], list[PlannedPhase]()
+def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Problem, Trajectory]:
+    """Phases and plan with blocks off curves planned anew, with a margin, where possible."""
+    blocks, phases, parts = split_blocks(problem), list[Phase](), list[PlannedPhase]()
+    while blocks:
+        (block, *later), replacement = blocks, list[PlannedPhase]()
         if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
-            for share in (1.0, 0.5, 0.25):
-                replacement = _replan_blocks(planner, problem, blocks[k:], plan, share)
+            for stop, share in STOPS:
+                stopped = _stop(block, plan, stop)
+                if stopped:
+                    rest = [*stopped, *later]
+                    replacement = _replan_blocks(planner, problem, rest, plan, share)
                 if replacement:
+                    blocks = rest
                     break
-        phases += replacement or list_phases(plan)[block[0].index : block[-1].index + 1]
-        while k < len(blocks) and blocks[k][-1].index < len(phases):
-            k += 1
+        parts += replacement or list_phases(plan)[block[0].index : block[-1].index + 1]
+        while blocks and blocks[0][0].index < len(parts):
+            phases += blocks.pop(0)
     samples = int(np.bincount(plan.phase).max())
-    meta = {**plan.meta, "modes": [phase.modes for phase in phases]}
-    torque = TorqueProfile.chain([phase.torque for phase in phases])
-    return assemble([phase.motion for phase in phases], torque, meta, samples)
+    meta = {**plan.meta, "modes": [part.modes for part in parts]}
+    torque = TorqueProfile.chain([part.torque for part in parts])
+    whole = assemble([part.motion for part in parts], torque, meta, samples)
+    return replace(problem, phases=tuple(phases)), whole
+
+
+def _stop(
+    block: tuple[Phase, ...], plan: Trajectory, share: float | None
+) -> list[tuple[Phase, ...]]:
+    """The block with a stop in place of its release, or nothing if it does not begin with one."""
+    first = block[0]
+    if share is None:
+        return [block]
+    if not first.until.is_release or first.formation.n_constraints != 4:
+        return []
+    start, end = (
+        plan.z[np.flatnonzero(plan.phase == phase.index)[row]]
+        for phase, row in ((first, 0), (block[-1], -1))
+    )
+    name = "phi" if abs(end[2] - start[2]) > SAME else "x"
+    row = ROWS[name]
+    value = float(start[row] + share * (end[row] - start[row]))
+    until = replace(first.until, coordinate=name, value=value)
+    return [(replace(first, end=End.REST, until=until),), block[1:]]
 
 
 def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
@@ -324,7 +370,7 @@ def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -
     scene = problem.scene
     most = (np.abs(plan.tau[rows]) / scene.torque_limit).max()
     least = np.nanmin(plan.c_n[rows]) / scene.scales.force
-    return bool(min(least, 1 - most) < 0.99 * ROOM)
+    return bool(least < 0.99 * PRESS or 1 - most < 0.99 * ROOM)
 
 
 def _replan_blocks(
@@ -357,14 +403,14 @@ def _solve(
     planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
 ) -> Trajectory | None:
     """Plan of phases from a configuration at rest, with a share of the margin."""
-    scene, room = problem.scene, share * ROOM
+    scene = problem.scene
     one, two = (
-        replace(link, torque_limit=(1 - room) * link.torque_limit) for link in scene.fingers
+        replace(link, torque_limit=(1 - share * ROOM) * link.torque_limit) for link in scene.fingers
     )
     tightened = replace(
         problem,
         start=z,
-        epsilon=max(problem.epsilon, room * scene.scales.force),
+        epsilon=max(problem.epsilon, share * PRESS * scene.scales.force),
         scene=replace(scene, fingers=(one, two)),
         phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
@@ -215,10 +215,15 @@ class Simulation(Drawn):
                 forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
         return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
 
-    def list_pauses(self, contact: str, start: float, stop: float) -> list[tuple[float, float]]:
-        """When a contact does not press between two times [s], in their order."""
-        pauses, at = [], start
-        pressed = sorted((one.start, one.stop) for one in self.stretches if one.contact == contact)
+    def list_pauses(
+        self, contact: str, start: float, stop: float, aliases: Collection[str] = ()
+    ) -> list[tuple[float, float]]:
+        """When a contact does not press between two times [s], in their order.
+
+        `aliases` are other names under which it presses, as it goes on to a neighbouring feature.
+        """
+        pauses, at, names = [], start, {contact, *aliases}
+        pressed = sorted((one.start, one.stop) for one in self.stretches if one.contact in names)
         for first, last in pressed:
             if first > at:
                 pauses.append((at, min(first, stop)))

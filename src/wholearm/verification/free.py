@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
+from ..contacts.contact_limits import list_renamed
 from ..geometry.curve import describe_pose
 from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
@@ -256,6 +258,17 @@ def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
     return set(phase.formation.names) - set(() if after is None else after.formation.names)
 
 
+def list_aliases(problem: Problem, phase: Phase) -> dict[str, set[str]]:
+    """Contacts of neighbouring features that those of a phase go on from, or go on as."""
+    aliases: dict[str, set[str]] = {name: set() for name in phase.formation.names}
+    for before, after in pairwise(problem.phases[max(phase.index - 1, 0) : phase.index + 2]):
+        formations = before.formation.contacts, after.formation.contacts
+        for old, new in list_renamed(problem.scene, *formations).items():
+            here, there = (new, old) if after is phase else (old, new)
+            aliases[here.name].add(there.name)
+    return aliases
+
+
 def find_losses(
     simulation: FreeSimulation,
     phase: Phase,
@@ -269,10 +282,10 @@ def find_losses(
     Of each the first time, and that after a `moment` from `start` [s] on rather than one before.
     """
     scene, losses = simulation.problem.scene, []
-    system = build_system(scene)
+    system, aliases = build_system(scene), list_aliases(simulation.problem, phase)
     for name in phase.formation.names:
         openings = list[LostContact]()
-        for first, after in simulation.list_pauses(name, start, stop):
+        for first, after in simulation.list_pauses(name, start, stop, aliases[name]):
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
             if gaps.max(initial=0.0) > allowed * scene.scales.length:
