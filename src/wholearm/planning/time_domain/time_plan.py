@@ -121,8 +121,9 @@ def plan_phases(
             )
         else:
             named_solution = solve_guesses(search, [guess])
-    if named_solution is None:
-        named_solution = solve_guesses(search, guesses.list_given())
+    for guess in guesses.list_given() if named_solution is None else ():
+        # One by one: the first may lead to modes in which limits between points leave nothing.
+        named_solution = named_solution or solve_guesses(search, [guess])
     if named_solution is None:
         listed = iter([guesses.nearest])
         if patient:
