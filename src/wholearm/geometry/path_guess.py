@@ -163,6 +163,8 @@ class PathGuess:
     formation: Formation
     z: Array  # (n, 5): with all contacts closed, evenly spread
     directions: Directions
+    # rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses
+    turns: tuple[int, ...] = ()
 
     @property
     def length(self) -> float:
@@ -175,14 +177,13 @@ def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
     """Path guesses along a curve, or the first `share` of it, split at its reversals."""
     stop = share * curve.length
     parts = [part for part in curve.segments if part.start < stop]
-    return [
-        PathGuess(
-            curve.formation,
-            curve.evaluate(np.linspace(part.start, min(part.stop, stop), POINTS)).z,
-            Directions(part.Xi, part.sigma),
-        )
-        for part in parts
-    ]
+    guesses = []
+    signs = [np.concatenate([part.Xi, part.sigma]) for part in parts]
+    for part, here, there in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
+        s = np.linspace(part.start, min(part.stop, stop), POINTS)
+        turns, directions = np.flatnonzero(here != there).tolist(), Directions(part.Xi, part.sigma)
+        guesses.append(PathGuess(curve.formation, curve.evaluate(s).z, directions, tuple(turns)))
+    return guesses
 
 
 def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[PathGuess]:

@@ -2,9 +2,8 @@
 
 A guess follows a path from geometry alone, from rest to rest in time, or a plan. Contact modes are
 those of the path, or those of a motion with smoothed friction, tanh(rate / onset) in place of the
-sign (friction homotopy), which needs no modes. Both are split into stages by the signs of their
-rates. A contact whose rate rests for a while with smoothed friction, so that this is not all used,
-rolls.
+sign (friction homotopy), which needs no modes and is split into stages by the signs of its rates. A
+contact whose rate rests for a while with smoothed friction, so that this is not all used, rolls.
 """
 
 from __future__ import annotations
@@ -58,6 +57,7 @@ from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_sta
 
 NEAREST = "a motion to the nearest end of the phase"
 GIVEN = "the contact modes that the problem gives"
+LONGER = f"{NEAREST}, 4 times as long as a fall over that height"
 SURE = 1e-3  # margin above which a motion keeps its limits
 FALLS = 2.0  # guessed duration, over that of a fall over the path's length
 BRIEF = 0.05  # least duration of a piece over that of its stage
@@ -213,9 +213,10 @@ class Guesses:
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal) if self._is_planar() else None
-        if outline is None or find_margin(outline, self.problem.epsilon).value <= -0.3:
-            return None  # not near a motion
-        return self._follow("a motion straight to the end", outline)
+        margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
+        if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
+            return None
+        return self._follow("a motion straight to the end", outline, margin.profile)
 
     @cached_property
     def paths(self) -> list[tuple[PathMargin, PathGuess]]:
@@ -234,8 +235,7 @@ class Guesses:
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths."""
         name = "a motion straight to another end"
-        guesses = (self._follow(name, outline) for _, outline in self.paths[:3])
-        return filter(None, guesses)
+        return (self._follow(name, outline) for _, outline in self.paths[:3])
 
     def _is_planar(self) -> bool:
         """Whether there is a single phase, with two freedoms, that does not end by a release."""
@@ -251,10 +251,9 @@ class Guesses:
         free = formation.evaluate_limits(outline.z).min() > -formation.scene.touching
         return outline if moves and free else None
 
-    def _follow(self, name: str, outline: PathGuess) -> Guess | None:
-        """Along a path in its modes; None if these are too many."""
-        stages = split_by_signs(self._guess([outline]), self.search.scheme)
-        return Guess(name, stages) if stages else None
+    def _follow(self, name: str, outline: PathGuess, profile: PathSpeed | None = None) -> Guess:
+        """Along a path in its modes."""
+        return Guess(name, self._guess(split_path(outline), profile))
 
     def resume(self, name: str, stages: Sequence[Stage]) -> Guess:
         """From a solution with nearly the same start."""
@@ -280,6 +279,7 @@ class Guesses:
         yield self.nearest.by_homotopy()
         if not given:
             yield from self.to_others()
+            yield Guess(LONGER, self._guess(falls=2 * FALLS))
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
@@ -317,9 +317,14 @@ class Guesses:
                 last, length = goal, 1.2 * length  # ratio of successive distances
         return goals
 
-    def _guess(self, outlines: Sequence[PathGuess] = ()) -> list[Stage]:
+    def _guess(
+        self,
+        pieces: list[PathGuess] | None = None,
+        profile: PathSpeed | None = None,
+        falls: float = FALLS,
+    ) -> list[Stage]:
         arguments = self.problem, self.phases, self.z, self.search.scheme, self.search.options
-        return self._leave_room(guess_stages(*arguments, outlines))
+        return self._leave_room(guess_stages(*arguments, pieces, profile, falls))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows."""
@@ -336,16 +341,35 @@ def list_stages(plans: Sequence[PhasePlan[Motion]]) -> list[Stage]:
     return [stage for plan in plans for stage in plan.stages if isinstance(stage, Stage)]
 
 
+class PathSpeed(NamedTuple):
+    """Speed profile along a path."""
+
+    t: Array  # (n,) [s]
+    s: Array  # (n,): share of the length
+    v: Array  # (n,) [1/s]: its rate, piecewise linear in time
+    forces: Array  # (n - 1, n_c + R): in the intervals, over the weight of the object
+
+    def evaluate(self, passed: Array) -> tuple[Array, Array, Array]:
+        """Share of the length at shares of the time, and its derivatives by these."""
+        total = self.t[-1]
+        k = np.clip(np.searchsorted(self.t, passed * total) - 1, 0, len(self.forces) - 1)
+        begin, since = self.v[k], passed * total - self.t[k]
+        gain = (np.diff(self.v) / np.diff(self.t))[k]
+        place = self.s[k] + since * (begin + gain * since / 2)
+        return place, total * (begin + gain * since), total**2 * gain
+
+
 class PathMargin(NamedTuple):
     """Largest uniform margin of limits along a path at any speed, and the critical limit."""
 
     value: float  # -inf without a motion
     kind: str = ""  # of the limit with the largest sum of multipliers
     part: str = ""
+    profile: PathSpeed | None = None  # a fast one with nearly that margin
 
 
-def find_margin(outline: PathGuess, epsilon: float) -> PathMargin:
-    """Largest margin along a path, by a linear programme.
+def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> PathMargin:
+    """Largest margin along a path, by a linear programme; if `paced` also a speed profile.
 
     Unknowns are the squared speed b at the nodes, contact forces c in the intervals, and the
     margin. Friction is against the path; viscous friction and limits of speeds are neglected.
@@ -385,14 +409,77 @@ def find_margin(outline: PathGuess, epsilon: float) -> PathMargin:
     free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
     inside = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0), *free]  # the largest b
 
-    inside += [(None, 1.0)]
-    gain = -np.eye(size)[-1]
-    answer = linprog(gain, *inequalities, equal, equal_to, inside, method="highs")
+    def maximise(gain: Array, least: float | None) -> Any:
+        every = [*inside, (least, 1.0)]
+        return linprog(-gain, *inequalities, equal, equal_to, every, method="highs")
+
+    answer = maximise(np.eye(size)[-1], None)
     if answer.status != 0:
         return PathMargin(-np.inf)
     shares = np.abs(answer.ineqlin.marginals).reshape(m, -1).sum(axis=0)
-    critical = limits.limits[int(np.bincount(limits.owners[sides], shares).argmax())]
-    return PathMargin(float(answer.x[-1]), critical.kind, critical.part)
+    totals = np.bincount(limits.owners[sides], shares)
+    critical = limits.limits[int(totals.argmax())]
+    margin, profile = float(answer.x[-1]), None
+    # A fast one may lose half of a positive margin, and a little of a negative one.
+    speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(0.5 * margin, margin - 0.02)
+    fast = maximise(speeds, least) if paced else None
+    if fast is not None and fast.status == 0:
+        v = scene.scales.speed * np.sqrt(np.maximum(fast.x[: m + 1], 0.0))
+        slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
+        t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
+        length = np.append(0.0, np.cumsum(runs))
+        forces = fast.x[m + 1 : -1].reshape(m, width)
+        profile = PathSpeed(t, length / length[-1], v / length[-1], forces)
+    return PathMargin(margin, critical.kind, critical.part, profile)
+
+
+def split_path(outline: PathGuess) -> list[PathGuess]:
+    """A path as pieces between reversals, of which no two coincide: there motion would stop."""
+    z, formation = outline.z, outline.formation
+    steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
+    slip = np.einsum("nij,nj->ni", formation.evaluate(middles, steps).A_t, steps)
+    rates = np.hstack([slip, steps[:, 3:]])
+    signs = np.where(rates < 0, -1.0, 1.0)
+    signs[:, list(formation.rolling_rows)] = 1.0
+    cuts = [0]
+    for k in range(1, len(signs)):
+        if (signs[k] != signs[cuts[-1]]).any():
+            if k - cuts[-1] < 2:  # fewest steps of a piece
+                signs[cuts[-1] : k] = signs[k]
+            else:
+                cuts.append(k)
+    if len(signs) - cuts[-1] < 2 and len(cuts) > 1:
+        signs[cuts.pop() :] = signs[cuts[-1]]
+    stretches, part = list[PathGuess](), z[:1]
+    for begin, stop in pairwise([*cuts, len(signs)]):
+        stretch_signs, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
+        turning = list[tuple[int, ...]]()
+        if stop < len(signs):
+            # Tied rows together, in order of time.
+            turns = np.flatnonzero(stretch_signs != signs[stop]).tolist()
+            tied = (find_tied(formation, z[stop], row) for row in turns)
+            before, after = rates[stop - 1 : stop + 1]
+            share = np.full(len(before), 0.5)
+            np.divide(before, before - after, out=share, where=before * after < 0)
+            groups = {tuple(sorted({*rows} & {*turns})) for rows in tied}
+            turning = sorted(groups, key=lambda group: (share[group[0]], group))
+        # The reversals are within the steps before and after the cut.
+        places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
+        for rows, place in zip(turning, places, strict=True):
+            k = int(place)
+            end = z[k] + (place - k) * (z[k + 1] - z[k]) if len(turning) > 1 else z[stop]
+            if len(part) == 1:
+                part = np.stack([part[0], (part[0] + end) / 2])
+            stretches.append(_make_stretch(formation, np.vstack([part, end]), stretch_signs, rows))
+            stretch_signs[list(rows)] *= -1
+            part = end[None]
+    stretches.append(_make_stretch(formation, np.vstack([part, z[-1:]]), stretch_signs, ()))
+    return stretches
+
+
+def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:
+    Xi, sigma = np.split(signs.copy(), [formation.n_contacts])
+    return PathGuess(formation, z, Directions(Xi, sigma), tuple(rows))
 
 
 def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
@@ -405,11 +492,12 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
             return solution
         stages = solution.stages
     assert solution is not None
-    exact = [replace(piece, onset=0.0) for piece in split_by_signs(stages, search.scheme)]
-    if not exact:
+    pieces = [split_by_signs(stage, search.scheme) for stage in stages]
+    if not all(pieces):
         status = "with friction that sets in gradually things turn too often"
         return solution._replace(status=status, success=False)
-    return solution._replace(stages=exact)
+    exact = [replace(piece, onset=0.0) for parts in pieces for piece in parts]
+    return solution._replace(stages=link(merge(exact)))
 
 
 def join_modes(stages: Sequence[Stage]) -> list[Stage]:
@@ -418,26 +506,23 @@ def join_modes(stages: Sequence[Stage]) -> list[Stage]:
     return merge([in_mode(*pair) for pair in zip(stages, modes, strict=True)])
 
 
-def split_by_signs(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
-    """The stages in pieces with the modes of their rates; none if one has too many."""
-    pieces = list[Stage]()
-    for stage in stages:
-        signs, changes = _find_changes(stage, scheme)
-        if len(changes) >= MOST:
-            return []
-        # Changes that coincide are moved apart: otherwise the motion would have to stop.
-        widths = np.diff([0.0, *(place for place, _ in changes), 1.0])
-        widths = np.maximum(widths, min(BRIEF / 2, 0.5 / len(widths)))
-        edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
-        parts = list[tuple[StagePoints, Mode]]()
-        for (begin, stop), (_, new) in zip(pairwise(edges), [*changes, (1.0, {})], strict=True):
-            count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
-            guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
-            parts.append((guess, tuple(signs)))
-            for row, sign in new.items():
-                signs[row] = sign
-        pieces += divide(stage, parts)
-    return link(merge(pieces))
+def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
+    """Pieces of a stage in the modes of its rates, which have to be linked; none if too many."""
+    signs, changes = _find_changes(stage, scheme)
+    if len(changes) >= MOST:
+        return []
+    # Changes that coincide are moved apart: otherwise the motion would have to stop.
+    widths = np.diff([0.0, *(place for place, _ in changes), 1.0])
+    widths = np.maximum(widths, min(BRIEF / 2, 0.5 / len(widths)))
+    edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
+    parts = list[tuple[StagePoints, Mode]]()
+    for (begin, stop), (_, new) in zip(pairwise(edges), [*changes, (1.0, {})], strict=True):
+        count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
+        guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
+        parts.append((guess, tuple(signs)))
+        for row, sign in new.items():
+            signs[row] = sign
+    return divide(stage, parts)
 
 
 def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Change]]:
@@ -503,16 +588,18 @@ def guess_stages(
     z: Array,
     scheme: Scheme,
     options: PlanOptions,
-    paths: Sequence[PathGuess] = (),
+    pieces: Sequence[PathGuess] | None = None,
+    profile: PathSpeed | None = None,
+    falls: float = FALLS,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
-    The guessed duration is `FALLS` times that of a fall over the length of the initial paths,
-    which a single phase may be given.
+    The guessed duration is `falls` times that of a fall over the length of the initial paths. A
+    single phase may follow the pieces of a given one, with its speed profile.
     """
     parts = list[tuple[Phase, PathGuess, bool]]()  # in own units; whether the last of its phase
     for k, phase in enumerate(phases):
-        outlines = list(paths or guess_phase(phase, z, phases[k + 1 :]))
+        outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
         z, scaled = outlines[-1].z[-1], in_own_units(problem).phases[phase.index]
@@ -523,8 +610,11 @@ def guess_stages(
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
-    total = FALLS * float(np.sqrt(lengths.sum()))
+    total = falls * float(np.sqrt(lengths.sum()))
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    if profile is not None:
+        total = float(profile.t[-1]) / problem.scene.scales.time
+        clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
@@ -536,7 +626,7 @@ def guess_stages(
         whole = lengths[[owner is phase for owner, _, _ in parts]].sum()
         intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
-        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total)
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
@@ -574,30 +664,47 @@ def guess_stages(
 
 
 def _guess(
-    outline: PathGuess, scheme: Scheme, count: int, clock: Array, ends: Array, total: float
+    outline: PathGuess,
+    scheme: Scheme,
+    count: int,
+    clock: Array,
+    ends: Array,
+    total: float,
+    profile: PathSpeed | None,
 ) -> StagePoints:
-    """Motion along an initial path.
+    """Motion along an initial path, with normal forces nearest to equal ones without a profile.
 
     `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
+    formation = outline.formation
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
     bends = np.gradient(slopes, knots, axis=0)
+    breaks = np.linspace(0.0, 1.0, count + 1)
 
     def follow(share: Array) -> tuple[Array, Array, Array]:
-        span = max(ends[1] - ends[0], 1e-12)
-        turn = np.pi * (clock[0] + share * (clock[1] - clock[0]))
-        place = ((1 - np.cos(turn)) / 2 - ends[0]) / span
-        rate = np.pi / 2 * np.sin(turn)[..., None] / (span * total)
-        gain = np.pi**2 / 2 * np.cos(turn)[..., None] / (span * total**2)
+        passed = clock[0] + share * (clock[1] - clock[0])
+        span, turn = max(ends[1] - ends[0], 1e-12), np.pi * passed
+        place, rate, gain = (
+            ((1 - np.cos(turn)) / 2, np.pi / 2 * np.sin(turn), np.pi**2 / 2 * np.cos(turn))
+            if profile is None
+            else profile.evaluate(passed)
+        )
+        place = (place - ends[0]) / span
+        rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
         z, slope, bend = (
             np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
             for table in (outline.z, slopes, bends)
         )
         return z, slope * rate, slope * gain + bend * rate**2
 
-    duration = total * (clock[1] - clock[0])
-    return _add_forces(outline.formation, outline.directions, scheme, count, duration, follow)
+    duration, c = total * (clock[1] - clock[0]), None
+    if profile is not None:
+        at = breaks[:-1, None] + scheme.points / count
+        passed = clock[0] + at.ravel() * (clock[1] - clock[0])
+        indices = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        c = profile.forces[np.clip(indices, 0, len(profile.forces) - 1)]
+    return _add_forces(formation, outline.directions, scheme, count, duration, follow, c)
 
 
 def _add_forces(
@@ -607,10 +714,12 @@ def _add_forces(
     count: int,
     duration: float,
     follow: Callable[[Array], Sequence[Array]],
+    c: Array | None = None,
 ) -> StagePoints:
-    """A motion on `count` equal intervals, with normal forces nearest to equal ones, and torques.
+    """A motion on `count` equal intervals, with forces `c`, (count d, n_c + R), and torques.
 
-    `follow` takes shares of the `duration` and gives z, z' and z''.
+    `follow` takes shares of the `duration` and gives z, z' and z''. Without `c`, normal forces are
+    those nearest to equal ones.
     """
     scene, breaks = formation.scene, np.linspace(0.0, 1.0, count + 1)
     z, v, a = follow(breaks[:-1, None] + scheme.points / count)
@@ -619,15 +728,16 @@ def _add_forces(
     G = force_rows(formation, formation.evaluate(*flat[:2]), directions)
     applied = scene.applied_force - scene.dry * np.append(np.zeros(3), directions.sigma)
     needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
-    c = np.zeros((len(G), formation.n_constraints))
-    c[:, : formation.n_contacts] = _LIGHT
-    missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
-    c += [
-        np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
-        for rows, short in zip(G[:, :, :3], missing, strict=True)
-    ]
-    c_n = c[:, : formation.n_contacts]
-    c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
+    if c is None:
+        c = np.zeros((len(G), formation.n_constraints))
+        c[:, : formation.n_contacts] = _LIGHT
+        missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
+        c += [
+            np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
+            for rows, short in zip(G[:, :, :3], missing, strict=True)
+        ]
+        c_n = c[:, : formation.n_contacts]
+        c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
     # Torques of the motion, within limits, at about as many points as they have control points.
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     limit = 0.9 * scene.torque_limit
@@ -653,7 +763,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     """
     # Rolling contacts have no direction to keep.
     slides = np.delete(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
-    slides_to = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
+    directions = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
     outline_signs, formation = np.concatenate(outline.directions), outline.formation
     n_c = formation.n_contacts
     signs = outline_signs.copy()
@@ -661,13 +771,14 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     for k in range(n_c):
         if k not in formation.rolling_rows:
             together = [formation.names[i] for i in formation.turn_with(k)]
-            signs[k] = next((slides_to[name] for name in together if name in slides_to), signs[k])
+            signs[k] = next((directions[name] for name in together if name in directions), signs[k])
     differing = np.flatnonzero(signs != outline_signs).tolist()
-    turns = [*dict.fromkeys(formation.turn_with(k) for k in differing), ()]
+    turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
     pieces = []
-    cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 1).astype(int)
-    for turn, (begin, stop) in zip(turns, pairwise(cuts), strict=True):
-        directions = Directions(*np.split(signs.copy(), [n_c]))
-        pieces.append(PathGuess(formation, outline.z[begin : stop + 1], directions))
-        signs[list(turn)] = outline_signs[list(turn)]
+    cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
+    for k, (begin, stop) in enumerate(pairwise(cuts)):
+        turn = turns[k] if k < len(turns) else outline.turns
+        pieces.append(_make_stretch(formation, outline.z[begin : stop + 1], signs, turn))
+        if k < len(turns):
+            signs[list(turns[k])] = outline_signs[list(turns[k])]
     return pieces
