@@ -14,12 +14,11 @@ import time
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..common.errors import InfeasibleError, WholearmError
+from ..common.errors import WholearmError
 from ..common.fields import choice
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
@@ -28,9 +27,8 @@ from ..policy.make import make_policy
 from ..problem.definition import Problem
 from ..problem.read import build_problem
 from ..results.trajectory import Trajectory
-from ..search.find_route import find_route, forget_roadmaps
 from ..verification.free import verify_policy
-from .queries import DRAW
+from .queries import ask_route
 from .study import Case, Row, Study, format_table
 
 SAME = 1e-4  # relative difference of values of plans that count as the same
@@ -71,15 +69,11 @@ class Execution(Study):
 
     def run(self, case: Case) -> Row:
         """Find a route, and carry it out."""
-        drawn, seed, number, folder, objective, ways = case
-        problem = DRAW[drawn](seed, number, Path(folder))
-        forget_roadmaps()
-        row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
-        try:
-            answer = find_route(problem, objective)
-        except WholearmError as error:
-            kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
-            return row | {"kind": kind, "why": str(error)}
+        *route, ways = case
+        objective = route[-1]
+        problem, answer, row = ask_route(tuple(route))
+        if answer is None:
+            return row
         table = {key: entry for key, entry in problem.table.items() if key != "goal"}
         phases = tomllib.loads(answer.to_text())
         row |= {"kind": "solved", "phases": len(phases["phases"]), "ways": {}}

@@ -25,7 +25,7 @@ from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
-from ..search.find_route import find_route, forget_roadmaps
+from ..search.find_route import Answer, find_route, forget_roadmaps
 from ..verification.verify import verify
 from .scenes import Table
 from .study import Case, Row, Study, format_table
@@ -60,17 +60,9 @@ class Queries(Study):
 
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one."""
-        drawn, seed, number, folder, objective = case
-        problem = DRAW[drawn](seed, number, Path(folder))
-        forget_roadmaps()
-        row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
-        started = time.process_time()
-        try:
-            answer = find_route(problem, objective)
-        except WholearmError as error:
-            kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
-            return row | {"kind": kind, "first": time.process_time() - started, "why": str(error)}
-        row["first"] = time.process_time() - started
+        problem, answer, row = ask_route(case)
+        if answer is None:
+            return row
         row |= {"gap": answer.gap, "value": answer.plan.value, "phases": len(answer.plan.phases)}
         failures = verify(answer.problem, answer.plan).failures
         if failures:
@@ -79,7 +71,7 @@ class Queries(Study):
         goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
         further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
         with suppress(WholearmError):
-            find_route(problem.with_({"goal": further}), objective)
+            find_route(problem.with_({"goal": further}), case[4])
             row["second"] = time.process_time() - started
         return row | {"kind": "solved"}
 
@@ -141,6 +133,24 @@ def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
 
 
 DRAW = {"query": draw_query, "polygon": draw_polygon_query}
+
+
+def ask_route(case: Case) -> tuple[Problem, Answer | None, Row]:
+    """A problem with a goal, its route, if any, and a row with processor time or reason.
+
+    The case has what is drawn, its seed and number, folder of the problems, and the objective.
+    """
+    drawn, seed, number, folder, objective = case
+    problem = DRAW[drawn](seed, number, Path(folder))
+    forget_roadmaps()
+    row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
+    answer, started = None, time.process_time()
+    try:
+        answer = find_route(problem, objective)
+    except WholearmError as error:
+        row["kind"] = "blocked" if isinstance(error, InfeasibleError) else "no answer"
+        row["why"] = str(error)
+    return problem, answer, row | {"first": time.process_time() - started}
 
 
 def _draw_corners(rng: np.random.Generator, count: int) -> list[list[float]]:
