@@ -185,8 +185,8 @@ def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
 
 
 def _round(value: float, unit: float) -> float:
-    """A value with the decimals of a unit."""
-    return round(value, math.ceil(-math.log10(unit)))
+    """A value with the decimals of a unit, and no negative zero."""
+    return round(value, math.ceil(-math.log10(unit))) + 0.0
 
 
 Edges = Sequence[tuple[Edge, Sequence[CoarsePlan]]]
