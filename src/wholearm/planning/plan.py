@@ -221,7 +221,8 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             len(block.phases),
         ]
         for impact in impacts:
-            if impact.possible:
+            # Torques held over periods start from a plan that stops, which there is not.
+            if impact.possible and not planning.problem.scene.control_period:
                 report(f"phase {impact.phase}: what its impact saves")
                 at = impact.phase - first
                 bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
