@@ -914,8 +914,8 @@ class Replay(Run):
 
         `longest` is the time between them, over the scene's.
         """
-        rows, longest = list[int](), longest * self.system.scales.time
-        if self.coming_step - self.t <= longest:
+        rows, window = list[int](), longest * self.system.scales.time
+        if self.coming_step - self.t <= window:
             self.records.pop()
             while True:
                 self.coast(self.stop)
@@ -927,7 +927,7 @@ class Replay(Run):
             return False
         else:
             self.start = self.values
-            stretch = min(longest, self.stop - self.t)
+            stretch = min(window, self.stop - self.t)
             self.step_to(stretch)
             rows = self._find_turning(self.find_first(stretch, self.leg.rows.turning))
             if not rows:
@@ -941,10 +941,9 @@ class Replay(Run):
         return ended
 
     def _goes_on(self, longest: float) -> bool:
-        """Whether all that slides or turns is far too fast to come to rest in a time [s]."""
+        """Whether all that slides or turns is far too fast to rest in a time, over the scene's."""
         out, units = self.s.outputs, self.system.units[5:]
         fastest = np.abs(out[5:10] / units).max()
-        longest /= self.system.scales.time
         strongest = np.abs(out[self.s.to.acceleration] / units).max() * self.system.scales.time
         # Lever arms are below 100 units of the scene.
         least = 100 * longest * (strongest + fastest**2)
