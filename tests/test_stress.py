@@ -18,12 +18,12 @@ from wholearm.benchmark.refusals import (
     fast_margin,
     find_best,
     follow,
-    inertia_ratio,
     list_ends,
     resample,
     separate,
     slides,
     slow_margin,
+    uniqueness_ratio,
 )
 from wholearm.benchmark.scenes import draw_case, random_scene
 from wholearm.benchmark.stress import check_plan, compare_values
@@ -31,7 +31,7 @@ from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, reduced_inertia
+from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_toml
@@ -170,18 +170,16 @@ def test_planner_and_linear_programme_agree_on_the_weakest_hand(
     assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) >= -1e-9
 
 
-def test_inertia_is_that_of_the_determinant(
+def test_least_minors_are_those_of_the_planner(
     heptagon: Problem, course: tuple[Phase, Course], curves: tuple[Curve, ...]
 ) -> None:
     phase, (_, z, z_s) = course
     rough = replace(heptagon.scene, friction=Friction(0.6, 0.9, 0.9))
     formation = replace(phase.formation, scene=rough)
-    ratios = inertia_ratio(rough, replace(phase, formation=formation), z, z_s)
+    ratios = uniqueness_ratio(rough, replace(phase, formation=formation), z, z_s)
     part = curves[2].segments[0]
-    own = reduced_inertia(
-        formation, formation.evaluate(z[:1], z_s[:1]), Directions(part.Xi, part.sigma)
-    )
-    assert ratios[0] == pytest.approx(own[0], rel=1e-9)
+    minors = find_minors(formation, formation.evaluate(z[:1], z_s[:1]), part.Xi)
+    assert ratios[0] == pytest.approx(minors.ratios[0], rel=1e-9)
 
 
 def _ends() -> Array:

@@ -45,6 +45,7 @@ from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_ar
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
+from ..mechanics import UNIQUENESS
 from ..planning.plan import solve
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
@@ -315,17 +316,23 @@ def _solve_along(
     return _maximise(A_ub, np.concatenate(most), A_eq, np.concatenate(equal_to), bounds)
 
 
-def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
-    """Reduced inertia over that without friction, least of both sides, shape (n,): jams below 0."""
+def uniqueness_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    """Least ratio of a principal minor to that without friction, on both sides, shape (n,).
+
+    Forces are not unique at 0 and below.
+    """
     touches = [locate(scene, name, z) for name in phase.formation.names]
     signs, rows = _signs(scene, phase, z, z_s), constrain(scene, phase, z)[1]
-    light = rows / scene.mass_diagonal
-    without = np.linalg.det(light @ rows.transpose(0, 2, 1))
-    ratios = [
-        np.linalg.det(light @ _push(touches, phase.formation.rolling_rows, side)) / without
-        for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]]))
-    ]
-    return np.asarray(np.minimum(*ratios))
+    light, rolling = rows / scene.mass_diagonal, phase.formation.rolling_rows
+    without, ratios = light @ rows.transpose(0, 2, 1), []
+    owners = np.array([*range(len(touches)), *rolling])  # contact of each row
+    for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
+        matrix = light @ _push(touches, rolling, side)
+        for taken in product([False, True], repeat=len(touches)):
+            chosen = np.flatnonzero(np.array(taken)[owners])
+            minor = np.ix_(range(len(z)), chosen, chosen)
+            ratios.append(np.linalg.det(matrix[minor]) / np.linalg.det(without[minor]))
+    return np.asarray(np.min(ratios, axis=0))
 
 
 def _signs(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
@@ -578,11 +585,10 @@ def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
     s, z, z_s = resample(scene, phase, trace, PLACES)
     slow = slow_margin(scene, phase, epsilon, z, z_s)
-    free = float(inertia_ratio(scene, phase, z, z_s).min())
+    free = float(uniqueness_ratio(scene, phase, z, z_s).min())
     at = f"phase {phase.number}"
-    # Of the reduced inertia without friction.
-    if free < 0.02:
-        return Verdict("confirmed" if free < 0.0 else "close", f"{at}: inertia ratio {free:.3g}")
+    if free < UNIQUENESS.default:
+        return Verdict("confirmed" if free < 0.0 else "close", f"{at}: uniqueness {free:.3g}")
     if slow > CLEAR:
         return Verdict("refuted", f"{at}: a slow motion keeps all limits by {slow:.3g}")
     rests = (_stops_before(problem, phase), phase.end is End.REST)
