@@ -49,6 +49,7 @@ from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.modes import Collapse, Mode, close_contacts, find_mode, find_rest, respond
+from wholearm.simulation.prescribed import Replay
 from wholearm.simulation.run import find_root
 from wholearm.simulation.stepper import ModeStepper, build_stepper
 from wholearm.simulation.system import ContactRows, build_system
@@ -120,6 +121,24 @@ def test_finds_the_reversals_of_the_curve(index: int) -> None:
     simulation = simulate(problem, motion.fit(40, 7))
     reversals = simulation.find(EventKind.REVERSAL)
     assert [e.time for e in reversals] == pytest.approx(list(motion.turns[1:-1]), abs=1e-9)
+
+
+def test_a_reversal_next_to_a_stop_turns_all_that_slides() -> None:
+    """A speed of rounding against the plan: where it ends, forces are those from rest.
+
+    A contact that hardly slides there has no event of its own.
+    """
+    problem, motion = pick(0)
+    turn, scales = float(motion.turns[1]), problem.scene.scales
+    sample = motion.evaluate(np.array([turn + 1e-7]))
+    tangent = sample.z_dot[0] / np.linalg.norm(sample.z_dot[0])
+    torque = constant(sample.tau[0], 1.0)
+    replay = Replay(problem, torque, 1e-9, np.array([math.inf]), minima=False)
+    replay.enter(problem.phases[0], None)
+    replay.y[:10] = [*sample.z[0], *(-1e-8 * scales.speed * tangent)]
+    assert replay.go_on() is None
+    after = motion.curve.segments[1]
+    assert replay.signs == pytest.approx([*after.Xi, *after.sigma])
 
 
 @pytest.mark.parametrize("late", [-4e-7, 4e-7])

@@ -793,6 +793,9 @@ class Replay(Run):
         """
         formation, signs = self.formation, self.signs
         if formation.n_constraints >= 4:
+            if len(turned) and self.system.is_slower(self.v, STANDING):
+                # What slides does so with the one velocity; events of slow contacts come later.
+                turned = np.flatnonzero(signs).tolist()
             for row in turned:
                 signs[row] *= -1
                 self.note_change(row, -signs[row], signs[row])
