@@ -194,6 +194,10 @@ def test_ends_are_where_the_phase_ends() -> None:
     assert len(ends) > 5 and np.ptp(ends[:, 0]) > 0.01
     assert np.degrees(ends[:, 2]) == pytest.approx(9.5, abs=1e-6)
     assert np.abs(phase.formation.evaluate(ends, ends).C).max() < 1e-9
+    goal = ends[3]
+    pinned = replace(phase, until=replace(phase.until, pins=(("x", float(goal[0])),)))
+    (place,) = list_ends(tipping().scene, pinned, tipping().start, (goal[0], goal[2]))
+    assert place == pytest.approx(goal, abs=1e-9)
 
 
 def test_ends_are_found_though_a_joint_turns_far_on_the_way() -> None:

@@ -330,7 +330,7 @@ def uniqueness_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
         matrix = light @ _push(touches, rolling, side)
         for taken in product([False, True], repeat=len(touches)):
             chosen = np.flatnonzero(np.array(taken)[owners])
-            minor = np.ix_(range(len(z)), chosen, chosen)
+            minor = np.ix_(np.arange(len(z)), chosen, chosen)
             ratios.append(np.linalg.det(matrix[minor]) / np.linalg.det(without[minor]))
     return np.asarray(np.min(ratios, axis=0))
 
@@ -654,7 +654,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
         return np.zeros((0, 5))
     scale = np.sqrt(weights(scene))
     ends = [first]
-    for way in (1.0, -1.0):
+    for way in () if phase.until.pins else (1.0, -1.0):
         here, ahead = first, None
         for step in 0.08 * scene.scales.length * 1.12 ** np.arange(16):
             rows = _end_equations(scene, phase, here)[1] / scale
@@ -757,9 +757,12 @@ def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     """What is missing to contacts and end at one configuration, and its rows."""
     (gaps,), (rows,) = constrain(scene, phase, z[None])
     until = phase.until
+    places = dict(until.poses)
     if until.contact is not None:
         touch = locate(scene, until.contact.name, z[None])
-        return np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
-    k = 2 if until.coordinate == "phi" else 0
-    value = z[k] if until.value is None else until.value
-    return np.append(gaps, z[k] - value), np.vstack([rows, np.eye(5)[k]])
+        gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
+    elif not places:
+        k = 2 if until.coordinate == "phi" else 0
+        places = {k: z[k]}
+    missing = [z[k] - value for k, value in places.items()]
+    return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..common.arrays import Array
-from ..common.errors import SolverError, WholearmError
+from ..common.errors import ReplayError, SolverError, WholearmError
 from ..common.files import make_folder, write_text
 from ..geometry.tracing import check_phases, load
 from ..planning.plan import solve
@@ -156,7 +156,7 @@ def _plan(table: Mapping[str, Any], objective: str, scene: DrawnScene | None = N
             findings.append(("plan refuted by residual", "; ".join(faults[:3])))
     except WholearmError as error:
         row["text"] = str(error)
-        if row["outcome"] == "planned":
+        if row["outcome"] == "planned" or isinstance(error, ReplayError):
             findings.append(("plan refuted by replay", str(error)))
         elif isinstance(error, SolverError):
             findings.append(("no answer", str(error)))
