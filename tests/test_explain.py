@@ -267,7 +267,7 @@ def test_a_refusal_of_what_a_slow_motion_does_is_refuted(slide: Problem) -> None
 def test_jamming_is_confirmed_by_the_determinant(slide: Problem) -> None:
     rough = slide.with_({f"friction.{part}": 2.5 for part in ("palm", "finger1", "finger2")})
     verdict = judge(rough, JammingError("phase 1 jams at x = ..."), [])
-    assert verdict.kind == "confirmed" and "inertia ratio -" in verdict.reason
+    assert verdict.kind == "confirmed" and "uniqueness -" in verdict.reason
 
 
 @pytest.mark.parametrize(("until", "kind"), [("v4-palm", "confirmed"), ("v3-finger1", "refuted")])

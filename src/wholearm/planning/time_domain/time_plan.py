@@ -100,7 +100,7 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    from ..explain import change_limit, refuse
+    from ..explain import change_limit, name_phases, refuse
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     guesses = Guesses(problem, phases, z, search, to_go)
@@ -134,6 +134,13 @@ def plan_phases(
             search,
             listed,
             lambda: refuse(search, problem, phases, guesses.nearest.stages, explanation),
+        )
+    if named_solution is None and _can_last(search, stages):
+        numbers = name_phases([phase.number for phase in phases])
+        raise SolverError(
+            f"no plan for {numbers}: the solver did not converge for the largest margin, although "
+            "the motion of least time keeps all limits; try another duration (--duration) or "
+            "number of intervals per phase (--time-intervals)"
         )
     if named_solution is None:
         named_solution = _solve_elastic(search, guesses, explanation)
@@ -512,8 +519,7 @@ def _list_slow(
     search: TimeSearch, guesses: Iterator[Guess], fastest: list[Stage], pinned: bool, first: Guess
 ) -> Iterator[Guess]:
     """Guesses for the largest margin: time-optimal stages, and others, `pinned` to their end."""
-    lasts = sum(stage.guess.duration for stage in fastest)
-    if fastest and search.duration is not None and lasts <= search.duration:
+    if _can_last(search, fastest):
         # On as few intervals as the first guess has.
         coarse = list[Stage]()
         count = sum(stage.intervals for stage in first.stages) / len({s.phase for s in fastest})
@@ -526,6 +532,12 @@ def _list_slow(
     end = fastest[-1].guess.nodes[-1, 0] if pinned and fastest else None
     for guess in guesses:
         yield guess._replace(stages=[*guess.stages[:-1], replace(guess.stages[-1], stop=end)])
+
+
+def _can_last(search: TimeSearch, stages: Sequence[Stage]) -> bool:
+    """Whether stages, if any, keep the longest duration."""
+    lasts = sum(stage.guess.duration for stage in stages)
+    return bool(stages) and search.duration is not None and lasts <= search.duration
 
 
 def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
