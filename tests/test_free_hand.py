@@ -355,7 +355,7 @@ def make_body(
         none,
         none,
         np.full(len(pairs), mu),
-        Scales(np.sqrt(inertia / mass), mass, mass * G),
+        Scales.of(np.sqrt(inertia / mass), mass, mass * G),
     )
 
 

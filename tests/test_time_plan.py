@@ -74,7 +74,7 @@ from wholearm.planning.time_domain.time_nlp import pack
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
-from wholearm.verification.verdict import DEPARTURE, Allowance, describe_ends
+from wholearm.verification.verdict import DEPARTURE, Allowance, describe_failures
 
 SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""
@@ -805,7 +805,7 @@ def test_another_place_than_the_one_pinned_fails() -> None:
     for off, missed in ((0.0, False), (0.9, False), (1.1, True)):
         x = LANDS + off * allowance.departure * length
         pinned = replace(simulation, problem=pin(problem, 1, ("x", x)))
-        failures = describe_ends(pinned, allowance)
+        failures = list(describe_failures(pinned, (), None, allowance))
         assert bool(failures) == missed
         for failure in failures:
             assert failure.text.startswith("phase 2 ends at x = 16 mm, phi = ")

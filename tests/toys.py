@@ -73,7 +73,7 @@ class Toy:
         ends = [0.0, *self.breaks, self.length]
         scene = SimpleNamespace(
             gravity=9.81,
-            scales=Scales(1.0, 2.0, 2.0),
+            scales=Scales.of(1.0, 2.0, 2.0),
             torque_limit=np.array(self.limit),
             speed_limit=np.array(self.speed_limit),
             torque_rate_limit=np.array(self.rate_limit),

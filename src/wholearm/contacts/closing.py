@@ -139,9 +139,7 @@ def place_flush(scene: Scene, edge: int, x: float) -> Array:
 def close_finger(scene: Scene, q: Array, finger: int) -> float:
     """Joint angle at which a finger, closing from outside, first touches the object at `q` [rad].
 
-    Raises
-    ------
-    InputError  if the finger does not reach the object, or its joint is in the object or near it
+    InputError if the finger does not reach the object, or its joint is in the object or near it.
     """
     link = scene.fingers[finger]
     angle, _, (obstacle,) = _close_finger(scene, finger, *np.asarray(q)[:3, None])

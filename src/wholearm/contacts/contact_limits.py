@@ -35,16 +35,14 @@ class _Segment(NamedTuple):
 
 def build_finger_gap(scene: Scene) -> Expression:
     """Return the gap between the two links [m], an expression of the features' symbol z."""
-    return _GAPS(scene)
+    axes, _ = _build_separation()
+    thickness = sum(link.radius for link in scene.fingers)
+    return axes(build_features(scene).z[3:], _list_numbers(scene)) - thickness
 
 
-def _build_gap(scene: Scene) -> Expression:
-    links = build_features(scene).links
-    first, second = (
-        _Segment(link.base, link.tip, finger.length)
-        for link, finger in zip(links, scene.fingers, strict=True)
-    )
-    return _separate(first, second) - sum(link.radius for link in scene.fingers)
+def _list_numbers(scene: Scene) -> Array:
+    """Base and length of both links, shape (6,) [m]."""
+    return np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
 
 
 def _separate(one: _Segment, two: _Segment) -> Expression:
@@ -77,26 +75,23 @@ def _separate(one: _Segment, two: _Segment) -> Expression:
 
 
 @lru_cache(maxsize=1)
-def _build_gap_function() -> Batch:
-    """Gap between the axes of any two links, of theta and (base, length) of each."""
+def _build_separation() -> tuple[Expression, Batch]:
+    """CasADi function of theta and (base, length) of both links: the gap between their axes."""
     theta, numbers = ca.SX.sym("theta", 2), ca.SX.sym("numbers", 6)
     links = []
     for k in range(2):
         base, length = numbers[3 * k : 3 * k + 2], numbers[3 * k + 2]
         axis = ca.vertcat(ca.cos(theta[k]), ca.sin(theta[k]))
         links.append(_Segment(base, base + length * axis, length))
-    return Batch(ca.Function("finger_gap", [theta, numbers], [_separate(*links)]))
-
-
-_GAPS = Store(_build_gap, lambda scene: scene.shape)
+    function = ca.Function("finger_gap", [theta, numbers], [_separate(*links)])
+    return function, Batch(function)
 
 
 @exclusive
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
     """Signed distance of the links at configurations z (n, 5), (n,) [m]; NaN where theta is."""
-    numbers = np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
-    numbers = np.broadcast_to(numbers, (len(z), 6))
-    gaps = _build_gap_function()(z[:, 3:], numbers)[0][:, 0, 0]
+    numbers = np.broadcast_to(_list_numbers(scene), (len(z), 6))
+    gaps = _build_separation()[1](z[:, 3:], numbers)[0][:, 0, 0]
     return np.asarray(gaps - sum(link.radius for link in scene.fingers))
 
 
@@ -106,10 +101,7 @@ def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
         clearances = _list_clearances(scene, finger, held)
-        if finger is not None:
-            clearances = clearances if held else face(scene, finger, clearances)
-            clearances += build_obstacles(scene, finger, held)
-        limits += clearances
+        limits += clearances if finger is None else _list_obstacles(scene, finger, held, clearances)
     if scene.fingers_collide:
         limits.append(GapLimit(build_finger_gap(scene), FINGERS_TOUCH))
     return limits
@@ -161,7 +153,6 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     lengths = build_features(scene).edge_lengths
     i, part, count = contact.index, contact.part, len(lengths)
     before, after = (i - 1) % count, (i + 1) % count
-
     pointed = scene.fingers[finger].radius == 0
 
     def gains(feature: str, index: int, surface: str = "tip") -> Contact | None:
@@ -242,27 +233,27 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     return GapLimit(gap, text, contact)
 
 
-def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> GapLimit:
-    """Return the limit at which a vertex touches a link's far side; `apart` as of `confine`."""
+def _build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> GapLimit:
+    """Limit at which a vertex touches a link's far side; `apart` as of `_confine`."""
     link, part = build_features(scene).links[finger], scene.fingers[finger]
     gap = -link.vertex_gap[vertex] - 2 * part.radius
     text = f"v{vertex} touches the far side of finger {finger + 1}"
-    return GapLimit(confine(gap, link.vertex_run[vertex], part.length, apart), text)
+    return GapLimit(_confine(gap, link.vertex_run[vertex], part.length, apart), text)
 
 
-def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
+def _build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
     """Limit at which an edge touches a joint's circle; `held`: the tip touches that edge."""
     features = build_features(scene)
     gaps, runs = _place_joint(scene, finger)
-    gap = confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
+    gap = _confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
     for other in range(0 if held else gaps.shape[1]):
         if other != edge:
             gap = ca.fmax(gap, gaps[other] - gaps[edge])
     return GapLimit(gap, f"e{edge} touches the joint of finger {finger + 1}")
 
 
-def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
-    """Return the limit at which a vertex touches the circle about a joint."""
+def _build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
+    """Limit at which a vertex touches the circle about a joint."""
     features = build_features(scene)
     link, lengths = features.links[finger], features.edge_lengths
     _, runs = _place_joint(scene, finger)
@@ -274,39 +265,35 @@ def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
     return GapLimit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
 
 
-def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[GapLimit]:
-    """Return the limits of a link's far side and joint, with its contacts `held`."""
+def _list_obstacles(
+    scene: Scene, finger: int, held: list[Contact], gained: list[GapLimit]
+) -> list[GapLimit]:
+    """Limits of a link with its contacts `held`: those `gained`, of its far side and its joint."""
     vertices = range(scene.polygon.n_vertices)
-    if not held:
-        apart = build_apart(scene, finger)
-        limits = [build_far_side(scene, finger, i, apart) for i in vertices]
-        limits += [build_joint_edge(scene, finger, i, held=False) for i in vertices]
-        if scene.fingers[finger].radius > 0:
-            limits += [build_joint_vertex(scene, finger, i) for i in vertices]
-        return limits
-    if any((c.surface, c.feature) != ("tip", "e") for c in held):
-        return []
-    limits = []
-    for contact in held:
-        ahead = (contact.index + 1 - finger) % len(vertices)
-        limits.append(build_far_side(scene, finger, ahead, None))
-        limits.append(build_joint_edge(scene, finger, contact.index, held=True))
-    return limits
-
-
-def face(scene: Scene, finger: int, limits: list[GapLimit]) -> list[GapLimit]:
-    """Return limits of a link without contacts for an object that may be on its far side, too."""
-    apart = build_apart(scene, finger)
-    gaps = build_features(scene).links[finger].vertex_gap
-    return [
+    if held:
+        if any((c.surface, c.feature) != ("tip", "e") for c in held):
+            return gained
+        for contact in held:
+            ahead = (contact.index + 1 - finger) % len(vertices)
+            gained.append(_build_far_side(scene, finger, ahead, None))
+            gained.append(_build_joint_edge(scene, finger, contact.index, held=True))
+        return gained
+    # The object may be on the far side, too.
+    apart, gaps = build_apart(scene, finger), build_features(scene).links[finger].vertex_gap
+    limits = [
         limit._replace(value=ca.fmax(limit.value, apart - gaps[limit.gained.index] / 2))
         if limit.gained is not None and limit.gained.surface == "finger"
         else limit
-        for limit in limits
+        for limit in gained
     ]
+    limits += [_build_far_side(scene, finger, i, apart) for i in vertices]
+    limits += [_build_joint_edge(scene, finger, i, held=False) for i in vertices]
+    if scene.fingers[finger].radius > 0:
+        limits += [_build_joint_vertex(scene, finger, i) for i in vertices]
+    return limits
 
 
-def confine(
+def _confine(
     gap: Expression, run: Expression, length: float, apart: Expression | None = None
 ) -> Expression:
     """Return a gap that counts only where 0 <= run <= length.

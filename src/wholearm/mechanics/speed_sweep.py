@@ -90,9 +90,7 @@ def speed_sweep(
     b_guess : (N,)      b at the places about which viscous terms are linearized; neglected at rest
     sweeps              without a guess: most sweeps, each linearized about the one before
 
-    Raises
-    ------
-    NoMotionError  if there is one path, and no motion along it; with more, it is `blocked`
+    NoMotionError if there is one path, and no motion along it; with more, it is `blocked`.
     """
     shape = limits.rows.shape[:-3]
     rows = limits.rows.reshape(-1, *limits.rows.shape[-3:])

@@ -639,9 +639,7 @@ def make_policy(
     planner               replans phases with more degrees of freedom that leave no margin, unless
                           `reserve` is 0
 
-    Raises
-    ------
-    InputError  if a number is out of its range, or the plan is of another problem
+    InputError if a number is out of its range, or the plan is of another problem.
     """
     problem, plan = adopt_motion(problem, plan)
     ranges = find_ranges(problem, plan)

@@ -40,9 +40,7 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
 def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
     """The motion of a plan, and the problem with its phases where that has goals instead.
 
-    Raises
-    ------
-    InputError  if torques alone are given, or the plan ends elsewhere than at the last goal
+    InputError if torques alone are given, or the plan ends elsewhere than at the last goal.
     """
     problem, _, trajectory = adopt_torques(problem, plan)
     if trajectory is None:
@@ -84,10 +82,8 @@ def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
     path  a ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as
           dense as the torques are bent
 
-    Raises
-    ------
-    InputError  if the file has another ending or cannot be written, or torques alone are to be a
-                motion
+    InputError if the file has another ending or cannot be written, or torques alone are to be a
+    motion.
     """
     if isinstance(what, Problem):
         return save_problem(what, path)
@@ -107,9 +103,7 @@ _FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle", 
 def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
     """Check that the plan with this `meta` was made for a problem.
 
-    Raises
-    ------
-    InputError  if it was not, by the first key that differs, or does not say what it was made for
+    InputError if it was not, by the first key that differs, or does not say what it was made for.
     """
     tables = meta.get("problem")
     if not isinstance(tables, Mapping):
@@ -132,11 +126,8 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
     -------
     str  empty if nothing does
 
-    Raises
-    ------
-    InputError  if it makes no sense for the problem: the object has other vertices, by number, or
-                the hand is another one, a base or a length being off by more than a tenth of the
-                link
+    InputError if it makes no sense for the problem: the object has other vertices, by number, or
+    the hand is another one, a base or a length being off by more than a tenth of the link.
     """
     tables = meta.get("problem")
     if not isinstance(tables, Mapping):

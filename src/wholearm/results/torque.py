@@ -132,10 +132,8 @@ def read_torque_csv(path: str) -> TorqueProfile:
     Torques are linear between rows; a repeated time is a step. Lines that begin with ``#`` are
     comments; see `read_notes`.
 
-    Raises
-    ------
-    InputError  if the file cannot be read, a column is missing, a value is not a finite number, or
-                the times do not start at 0 and increase
+    InputError if the file cannot be read, a column is missing, a value is not a finite number, or
+    the times do not start at 0 and increase.
     """
     with _open(path) as stream:
         reader = csv.reader(stream)
@@ -172,9 +170,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
 def read_notes(path: str) -> dict[str, str]:
     """What comments ``# key = value`` of a CSV file say, by their keys.
 
-    Raises
-    ------
-    InputError  if the file cannot be read
+    InputError if the file cannot be read.
     """
     with _open(path) as stream:
         comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
@@ -253,10 +249,8 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
     ended. With the interpolation ``"linear"`` they are joined by straight lines; with ``"hold"``
     each is held until the next one, and its row is there twice, at both ends of its period.
 
-    Raises
-    ------
-    InputError  if the rate is not a positive number or gives fewer than two samples, or the
-                interpolation is another one
+    InputError if the rate is not a positive number or gives fewer than two samples, or the
+    interpolation is another one.
     """
     rate = require_sampling(rate, interpolation)
     start, count = torque.breaks[0], torque.duration * rate
@@ -275,9 +269,7 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
 def require_sampling(rate: object, interpolation: str) -> float:
     """The rate [Hz] as a number, if it and the interpolation are allowed.
 
-    Raises
-    ------
-    InputError  if they are not
+    InputError if they are not.
     """
     if interpolation not in INTERPOLATIONS:
         allowed = " and ".join(INTERPOLATIONS)

@@ -133,9 +133,7 @@ class Trajectory(Drawn):
         At a phase boundary the later phase answers. The contacts are all of the trajectory's;
         forces are NaN where a contact is not in the formation.
 
-        Raises
-        ------
-        ValueError  if one of the times is outside the trajectory
+        ValueError if one of the times is outside the trajectory.
         """
         times, starts = np.atleast_1d(np.asarray(t, dtype=float)), self.phase_starts
         inside = (times >= starts[0]) & (times <= starts[-1])
@@ -185,9 +183,7 @@ class Trajectory(Drawn):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a ``.npz`` file.
 
-        Raises
-        ------
-        InputError  if the file cannot be written
+        InputError if the file cannot be written.
         """
         require_ending(path, ".npz")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
@@ -202,9 +198,7 @@ class Trajectory(Drawn):
 
         Rows are as dense as the torques are bent; `planning.replay_check` also replays them.
 
-        Raises
-        ------
-        InputError  if the file cannot be written
+        InputError if the file cannot be written.
         """
         require_ending(path, ".csv")
         write_text(path, format_rows(place_rows(self.torque)))
@@ -286,9 +280,7 @@ _ARRAYS = {
 def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Read a trajectory file.
 
-    Raises
-    ------
-    InputError  if the file cannot be read, or an array is missing or of the wrong shape
+    InputError if the file cannot be read, or an array is missing or of the wrong shape.
     """
     source = str(path)
     extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}

@@ -64,7 +64,7 @@ _SIZE, _DRIVE = "times the object's size", "times the torque limit or m g length
 
 
 def _get_drive(scene: Any, finger: Any) -> float:
-    return float(max(finger.torque_limit, scene.polygon.mass * scene.gravity * finger.length))
+    return float(max(finger.torque_limit, scene.weight * finger.length))
 
 
 def _get_strength(scene: Any, finger: Any) -> float | None:
@@ -75,7 +75,7 @@ def _get_strength(scene: Any, finger: Any) -> float | None:
 
 def _get_press(scene: Any, _: object) -> float:
     press = (finger.torque_limit / finger.length for finger in scene.fingers)
-    return float(max(scene.polygon.mass * scene.gravity, *press))
+    return float(max(scene.weight, *press))
 
 
 FRICTION = Range(0.0, 10.0)
@@ -95,13 +95,7 @@ EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
 
 
 def check_ranges(scene: Scene) -> None:
-    """Check the numbers of a scene.
-
-    Raises
-    ------
-    InputError  for the first that is out of its range; names the key, what is given and what is
-                allowed
-    """
+    """Raise an `InputError` for the first number of a scene that is out of its range."""
     parts: list[list[tuple[str, Any]]] = [
         [("object.", scene.polygon)],
         [("", scene)],
@@ -137,41 +131,29 @@ def _read_corners(given: object, key: str) -> Array:
     if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
         raise InputError("", key, f"{given!r} is not a list of 3 or more points")
     if len(given) > 500:
-        allowed = "allowed are 3 to 500"
-        raise InputError("", key, f"{len(given)} corners given; {allowed}")
+        raise InputError("", key, f"{len(given)} corners given; allowed are 3 to 500")
     return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
 
 
 CORNERS = FieldKind(
-    _read_corners,
-    {"type": "array", "minItems": 3, "maxItems": 500, "items": POINT.schema},
+    _read_corners, {"type": "array", "minItems": 3, "maxItems": 500, "items": POINT.schema}
 )
+_CORNERS_TEXT = "Corners of a convex polygon, anticlockwise, from any origin [m]."
+_BODY = Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density")
+_BODY_TEXT = "About the centroid [kg m^2]; by default that of uniform density."
 
 
 @declare(
-    key(
-        "vertices",
-        "Corners of a convex polygon, anticlockwise, from any origin [m].",
-        *(CORNERS, "length"),
-        attribute="points",
-    ),
+    key("vertices", _CORNERS_TEXT, CORNERS, "length", attribute="points"),
     key("mass", "[kg]", POSITIVE, "mass", Range(1e-6, 1e6)),
-    key(
-        "inertia",
-        "About the centroid [kg m^2]; by default that of uniform density.",
-        *(POSITIVE, "inertia"),
-        Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density"),
-    ),
+    key("inertia", _BODY_TEXT, POSITIVE, "inertia", _BODY),
 )
 @dataclass(frozen=True, eq=False)
 class Polygon:
     """The object: a rigid convex polygon.
 
-    Raises
-    ------
-    InputError  if the corners are not those of a convex anticlockwise polygon, or a number is not
-                positive; if the polygon is too small, too large or too slender, or has too short an
-                edge
+    InputError if the corners are not those of a convex anticlockwise polygon, or a number is not
+    positive; if the polygon is too small, too large or too slender, or has too short an edge.
     """
 
     points: ArrayLike
@@ -197,8 +179,9 @@ class Polygon:
         if area <= 0:
             text = f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
             raise InputError("", "object.vertices", f"{text}list its corners anticlockwise")
-        turns = cross_product(np.roll(edges, 1, axis=0), edges)
-        headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
+        before = np.roll(edges, 1, axis=0)
+        turns = cross_product(before, edges)
+        headings = np.arctan2(turns, np.sum(before * edges, axis=1))
         reflex = np.flatnonzero(turns <= 1e-9 * area)
         if reflex.size:
             text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
@@ -278,81 +261,42 @@ TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyrat
 HOLDS = ("constant", "linear")  # how torques may be held over control periods
 
 
+_LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
+_RADIUS = Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0")
+_INERTIA = Range(1e-8, 1e3, lambda scene, f: scene.polygon.mass * f.length**2, "times m length^2")
+_VISCOUS = Range(
+    0.0, 200.0, lambda scene, f: _get_drive(scene, f) * scene.scales.time, f"{_DRIVE}, x {{time}}"
+)
+_DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
+_TORQUE = Range(1e-6, 1e3, lambda scene, f: scene.weight * f.length or None, "times m g length")
+_STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
+_SPEED = Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}")
+_RATE = Range(
+    1e-4, 1e9, lambda scene, f: f.torque_limit / scene.scales.time, "torque limits in {time}"
+)
+_LAG = relate_time(0.0, 1e2, "x {time}")
+_RATE_TEXT = "How quickly the torque may change [N m/s]; none by default: it may step."
+_LAG_TEXT = "Time constant with which the torque follows its command [s]."
+
+
 @declare(
     key("base", "The joint [m].", POINT, "length", PLACE),
-    key(
-        "length",
-        "From the joint to the centre of the tip [m].",
-        *(POSITIVE, "length"),
-        Range(0.03, 100.0, PLACE.scale, _SIZE),
-    ),
-    key(
-        "radius",
-        "Half thickness of the link [m].",
-        *(NONNEGATIVE, "length"),
-        Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0"),
-        default=0.0,
-    ),
-    key(
-        "inertia",
-        "About the joint [kg m^2].",
-        *(POSITIVE, "inertia"),
-        Range(
-            *(1e-8, 1e3),
-            lambda scene, finger: scene.polygon.mass * finger.length**2,
-            "times m length^2",
-        ),
-    ),
+    key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", _LENGTH),
+    key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", _RADIUS, default=0.0),
+    key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", _INERTIA),
     key(
         "viscous",
         "Viscous friction of the joint [N m s].",
-        *(NONNEGATIVE, "drag"),
-        Range(
-            *(0.0, 200.0),
-            lambda scene, finger: _get_drive(scene, finger) * scene.scales.time,
-            f"{_DRIVE}, x {{time}}",
-        ),
+        NONNEGATIVE,
+        "drag",
+        _VISCOUS,
         default=0.0,
     ),
-    key(
-        "dry",
-        "Dry friction of the joint [N m].",
-        *(NONNEGATIVE, "torque"),
-        Range(0.0, 1e3, _get_drive, _DRIVE),
-        default=0.0,
-    ),
-    key(
-        "torque_limit",
-        "[N m]",
-        *(POSITIVE, "torque"),
-        Range(
-            *(1e-6, 1e3),
-            lambda scene, finger: scene.polygon.mass * scene.gravity * finger.length or None,
-            "times m g length",
-        ),
-        Range(1e-6, 1e6, _get_strength, "times finger 2's strength"),
-    ),
-    key(
-        "speed_limit",
-        "Of the joint [rad/s]; none by default.",
-        *(POSITIVE, "rate"),
-        Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}"),
-    ),
-    key(
-        "torque_rate_limit",
-        "How quickly the torque may change [N m/s]; none by default: it may step.",
-        *(POSITIVE, "torque_rate"),
-        Range(
-            *(1e-4, 1e9),
-            lambda scene, finger: finger.torque_limit / scene.scales.time,
-            "torque limits in {time}",
-        ),
-    ),
-    key(
-        "actuator_lag",
-        "Time constant with which the torque follows its command [s].",
-        *(NONNEGATIVE, "time", relate_time(0.0, 1e2, "x {time}")),
-    ),
+    key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", _DRY, default=0.0),
+    key("torque_limit", "[N m]", POSITIVE, "torque", _TORQUE, _STRENGTH),
+    key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", _SPEED),
+    key("torque_rate_limit", _RATE_TEXT, POSITIVE, "torque_rate", _RATE),
+    key("actuator_lag", _LAG_TEXT, NONNEGATIVE, "time", _LAG),
 )
 @dataclass(frozen=True, eq=False)
 class Finger:
@@ -402,46 +346,22 @@ class Scales(NamedTuple):
     # [N]: weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
     # finger can press with at its tip
     force: float
+    time: float  # [s]: in which the force moves the mass by about the length
+    speed: float  # [m/s]: the others follow from these
+    acceleration: float  # [m/s^2]
+    rate: float  # [rad/s]
+    inertia: float  # [kg m^2]
+    torque: float  # [N m]
+    torque_rate: float  # [N m/s]
+    drag: float  # [N m s]
 
-    @property
-    def torque(self) -> float:
-        """Force times length [N m]."""
-        return self.force * self.length
-
-    @property
-    def inertia(self) -> float:
-        """Mass times length squared [kg m^2]."""
-        return self.mass * self.length**2
-
-    @property
-    def drag(self) -> float:
-        """Torque times time [N m s]."""
-        return self.torque * self.time
-
-    @property
-    def rate(self) -> float:
-        """One over time [rad/s]."""
-        return 1 / self.time
-
-    @property
-    def torque_rate(self) -> float:
-        """Torque over time [N m/s]."""
-        return self.torque / self.time
-
-    @property
-    def time(self) -> float:
-        """In which the force moves the mass by about the length [s]."""
-        return math.sqrt(self.mass * self.length / self.force)
-
-    @property
-    def speed(self) -> float:
-        """Length over time [m/s]."""
-        return self.length / self.time
-
-    @property
-    def acceleration(self) -> float:
-        """Force over mass [m/s^2]."""
-        return self.force / self.mass
+    @staticmethod
+    def of(length: float, mass: float, force: float) -> Scales:
+        """The units that follow from three."""
+        time, torque = math.sqrt(mass * length / force), force * length
+        motion = time, length / time, force / mass, 1 / time
+        others = mass * length**2, torque, torque / time, torque * time
+        return Scales(length, mass, force, *motion, *others)
 
 
 @declare(
@@ -466,9 +386,7 @@ class Scales(NamedTuple):
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
 
-    Raises
-    ------
-    InputError  if finger 1 is not to the right of finger 2, or a value is not of its type
+    InputError if finger 1 is not to the right of finger 2, or a value is not of its type.
     """
 
     polygon: Polygon
@@ -493,11 +411,10 @@ class Scene:
     @cached_property
     def scales(self) -> Scales:
         """Units that fit the scene: tolerances count in them."""
-        mass = self.polygon.mass
+        mass, weight = self.polygon.mass, self.weight
         press = min(finger.torque_limit / finger.length for finger in self.fingers)
-        weight = mass * self.gravity
         force = weight if weight > 1e-4 * press else press / 100
-        return Scales(self.polygon.gyration_radius, mass, force)
+        return Scales.of(self.polygon.gyration_radius, mass, force)
 
     @cached_property
     def shape(self) -> tuple[object, ...]:
@@ -524,17 +441,19 @@ class Scene:
     @cached_property
     def mass_diagonal(self) -> Array:
         """Diagonal of M5, shape (5,): m, m, I, J_1, J_2 [kg, kg m^2]."""
-        body = self.polygon
+        body, joints = self.polygon, [finger.inertia for finger in self.fingers]
         assert body.inertia is not None
-        joints = [finger.inertia for finger in self.fingers]
-        diagonal = np.array([body.mass, body.mass, body.inertia, *joints])
-        diagonal.setflags(write=False)
-        return diagonal
+        return frozen([body.mass, body.mass, body.inertia, *joints])
+
+    @property
+    def weight(self) -> float:
+        """Weight of the object [N]."""
+        return self.polygon.mass * self.gravity
 
     @property
     def applied_force(self) -> Array:
         """Gravity as a force on z, shape (5,) [N, N m]: the vector g of the equations of motion."""
-        return np.array([0.0, -self.polygon.mass * self.gravity, 0.0, 0.0, 0.0])
+        return np.array([0.0, -self.weight, 0.0, 0.0, 0.0])
 
     @property
     def viscous(self) -> Array:

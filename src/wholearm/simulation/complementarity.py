@@ -117,12 +117,11 @@ def solve_problem(p: ContactProblem) -> ContactAnswer | None:
     M[k + i, minus + i] = M[plus + i, minus + i] = 1.0
     M[minus + i, k + i] = M[minus + i, plus + i] = -1.0
     M[minus + held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
-    solution = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
+    z, residual = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
     size = float(np.abs(q).max(initial=0.0)) or 1.0
-    if not solution.residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
+    if not residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
         return None
-    z = solution.z
-    return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), solution.residual / size)
+    return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), residual / size)
 
 
 def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
@@ -139,13 +138,6 @@ def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.
     sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
     shares = size / np.maximum(most, 1e-300)
     return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, sign, change, residual)
-
-
-def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bool:
-    """Whether each contact presses or parts by more than a share of the largest rate."""
-    s_n, _, _, q = problem.scaled
-    most = least * float(np.abs(q).max(initial=0.0))
-    return bool((np.maximum(answer.c_n / s_n, answer.r_n * s_n) > most).all())
 
 
 @lru_cache(maxsize=256)
@@ -224,23 +216,15 @@ def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list
     ]
 
 
-class ContactSolution(NamedTuple):
-    """Solution of a linear complementarity problem."""
-
-    z: Array  # z, w (n,):
-    w: Array
-    # largest violation of z >= 0, w >= 0, z w = 0 and w = M z + q; infinite on a ray
-    residual: float
-
-
-def solve_lcp(M: Array, q: Array) -> ContactSolution:
+def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
     """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one.
 
-    Complementary pivoting until the artificial unknown z_0 leaves the basis.
+    Complementary pivoting until the artificial unknown z_0 leaves the basis. Returns z, (n,), and
+    the largest violation of these conditions, infinite on a ray.
     """
     n = len(q)
     if (q >= 0).all():
-        return ContactSolution(np.zeros(n), q.copy(), 0.0)
+        return np.zeros(n), 0.0
     # Columns: the right-hand side, w, z and z_0.
     table = np.empty((n, 2 * n + 2))
     table[:, 0], table[:, 1 : n + 1] = q / float(np.abs(q).max()), np.eye(n)
@@ -267,7 +251,7 @@ def solve_lcp(M: Array, q: Array) -> ContactSolution:
         low = rising[ratios <= ratios.min() + 1e-12]
         last = low[basis[low] == 2 * n + 1]
         row = int(last[0]) if len(last) else _choose(table, rising, column[rising])
-    return ContactSolution(np.full(n, np.nan), np.full(n, np.nan), np.inf)
+    return np.full(n, np.nan), np.inf
 
 
 def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
@@ -282,7 +266,7 @@ def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
     return int(rows[least[0]])
 
 
-def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> ContactSolution:
+def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> tuple[Array, float]:
     """Solution of a complementary basis, from the original matrix."""
     n = len(q)
     chosen = basis[basis > n] - n - 1
@@ -293,10 +277,8 @@ def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> ContactSolution:
         except np.linalg.LinAlgError:
             z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen])[0]
     w = M @ z + q
-    wrong = [np.abs(w[chosen]), -z, -w, np.zeros(1)]
-    residual = float(max(part.max(initial=0.0) for part in wrong))
-    w[chosen] = 0.0
-    return ContactSolution(np.maximum(z, 0.0), np.maximum(w, 0.0), residual)
+    residual = float(max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w)))
+    return np.maximum(z, 0.0), residual
 
 
 class ClosedContacts(NamedTuple):
@@ -446,9 +428,9 @@ class FreeRun(Run):
             if self.t >= self.stop:
                 self.next_piece()
             closed = self._collide()
-            moved = not self.stands()
+            moved = not self.stands
             rests = self._decide(closed)
-            if moved and self.stands():
+            if moved and self.stands:
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
                 self.note_at(EventKind.GIVEN_UP, "decisions do not end")
@@ -498,10 +480,6 @@ class FreeRun(Run):
     ) -> None:
         """Append an event at present, whose text says when."""
         self.note(kind, f"{text} at t = {self.t:.6g} s", contact, value)
-
-    def stands(self) -> bool:
-        """Whether nothing moves."""
-        return self.system.is_slower(self.v, STANDING)
 
     def _is_still(self, acceleration: Array) -> bool:
         return self.system.is_slower(acceleration * self.system.scales.time, STILL)
@@ -656,8 +634,10 @@ class FreeRun(Run):
             return None
         acceleration = free + first.change
         self.unique = problem.is_unique
-        # What is clearer does not vanish within that time.
-        if not self.unique or not is_clear(problem, first, 1e-3):
+        # What presses or parts by more does not vanish within that time.
+        s_n, _, _, q = problem.scaled
+        least = 1e-3 * float(np.abs(q).max(initial=0.0))
+        if not self.unique or (np.maximum(first.c_n / s_n, first.r_n * s_n) <= least).any():
             v = self.v + later * acceleration
             rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
             coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
@@ -666,7 +646,7 @@ class FreeRun(Run):
             return None
         # What rests leaves its last modes by rounding, before it takes others in which it rests.
         still = self.resting or self._is_still(acceleration)
-        rests = self.stands() and still and self._is_still(coming + answer.change)
+        rests = self.stands and still and self._is_still(coming + answer.change)
         modes = pattern.make_modes(answer, rows)
         self._note_changes(pattern.closed, modes, rests)
         self.modes = modes

@@ -164,9 +164,7 @@ class Simulation(Drawn):
     def trajectory(self) -> Trajectory:
         """The simulated motion as a trajectory, as of a plan, without phases of one instant.
 
-        Raises
-        ------
-        SimulationError  if there is no motion
+        SimulationError if there is no motion.
         """
         chosen, problem = list[NDArray[np.int64]](), self.problem
         # Rows whose times increase in each phase, but for one repetition where forces step.
@@ -235,9 +233,7 @@ class Simulation(Drawn):
     def at(self, t: float) -> Array:
         """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
 
-        Raises
-        ------
-        ValueError  if `t` was not among the instants asked for and no step ends there
+        ValueError if `t` was not among the instants asked for and no step ends there.
         """
         index = int(np.searchsorted(self.t, t, side="right")) - 1
         if index < 0 or self.t[index] != t:

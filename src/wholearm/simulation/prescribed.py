@@ -26,7 +26,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, cast
 
 import casadi as ca
 import numpy as np
@@ -159,10 +159,8 @@ def _build_leg(
     measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
     function = ca.Function("measure", [packed, start], [measured])
     start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
-    measure, texts = (
-        bind(function, [s.outputs, start], event_values),
-        [limit.text for limit in limits],
-    )
+    measure = bind(function, [s.outputs, start], event_values)
+    texts = [limit.text for limit in limits]
     return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
 
 
@@ -269,8 +267,8 @@ class Replay(Run):
 
     def take(self, mode: Mode) -> None:
         """Go on with the steps of a mode of the phase's formation."""
-        modes = mode.find_modes()
-        self.load(modes._replace(Xi=(0.0,) * len(modes.kept), sigma=(0.0,) * 5))
+        self.load(mode.find_modes())
+        self.signs = np.zeros(self.formation.n_contacts + 2)
         self.leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
         self.slack = self.leg.slack
         self.leg.heading[:] = 0.0
@@ -316,10 +314,8 @@ class Replay(Run):
         """Raise the error for a step size that underflows."""
         names = " ".join(self.formation.names)
         if not ratio > 1e-3:
-            raise JammingError(
-                f"{names} jams {self.when()}: friction makes the reduced inertia {ratio:.3g} of "
-                "its frictionless value"
-            )
+            text = f"friction makes the reduced inertia {ratio:.3g} of its frictionless value"
+            raise JammingError(f"{names} jams {self.when()}: {text}")
         raise SimulationError(f"the step size of {names} underflows {self.when()}")
 
     def lose(self, contact: str, c_n: float) -> Outcome:
@@ -492,10 +488,9 @@ class Replay(Run):
         """Integrate until the motion rests, arrives, releases its contacts or fails."""
         self.h = min(self.h, FIRST_STEP * self.system.scales.time)
         try:
-            ending: Ending = super().move()
+            return cast(Ending, super().move())
         except StuckError:
             self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
-        return ending
 
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
@@ -671,7 +666,7 @@ class Replay(Run):
         self.y[:5] = self._close(formation)
         self.impact += float(old - self.system.stored(self.z, self.v))
         self.project_velocity(formation.evaluate(self.z[None], self.v[None]).P[0])
-        self.moving = self.moving and not self.system.is_slower(self.v, STANDING)
+        self.moving = self.moving and not self.stands
         if not self.moving:
             self.set_velocity(0.0)
         # At any speed a contact can be gained only where it goes on for another one.
@@ -700,9 +695,7 @@ class Replay(Run):
     def _close(self, formation: Formation) -> Array:
         """The present configuration with every contact of a formation closed."""
         try:
-            return close_contacts(
-                formation, self.z, 10 * REACHED * self.problem.scene.scales.length
-            )
+            return close_contacts(formation, self.z, 10 * REACHED * self.system.scales.length)
         except SimulationError as error:
             raise SimulationError(f"{error} {self.when()}") from None
 
@@ -729,11 +722,9 @@ class Replay(Run):
         formation, signs = self.formation, departure.signs
         mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
-            rows = evaluate_rows(formation, self.z, self.v)
-            fixed = find_fixed(mode, rows)
-            self.stuck = {
-                row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]
-            }
+            fixed = find_fixed(mode, evaluate_rows(formation, self.z, self.v))
+            gripped = (row for u in list_units(formation) if u.grips for row in u.rows)
+            self.stuck = {row for row in gripped if fixed[row]}
         self.start_with(mode, signs, departure.heading)
         self.observe()
 
@@ -748,13 +739,13 @@ class Replay(Run):
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
         self.leg.heading[:] = v / np.sqrt(self.system.mass @ v**2)
-        rates = np.concatenate([formation.evaluate(self.z[None], v[None]).A_t[0] @ v, v[3:]])
-        signs = np.where(rates < 0, -1.0, 1.0)
-        for row, name in enumerate(formation.names):
-            signs[row] = self.slip_signs.get(name, signs[row])
+        rates = np.concatenate([evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
+        movable = [row for unit in list_units(formation) for row in unit.rows]
+        signs = np.zeros(len(rates))
+        signs[movable] = np.where(rates < 0, -1.0, 1.0)[movable]
+        for name, sign in self.slip_signs.items():
+            signs[formation.names.index(name)] = sign
         self.slip_signs = {}
-        movable = {row for unit in list_units(formation) for row in unit.rows}
-        signs[[row for row in range(len(signs)) if row not in movable]] = 0.0
         self.signs = signs
         return self.restart(enters=formation.n_constraints < 4)
 
@@ -770,11 +761,11 @@ class Replay(Run):
             return self.come_to_rest()
         if self._list_pulling() and self._bridge(BRIDGED):
             return self.come_to_rest()
-        holders = self.leg.mode.holders
         self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()
-        slipping = {holders[k][0] for k in self.find_slipping()}
+        reserves, holders = self._measure_reserves(), self.leg.mode.holders
+        slipping = {holders[k][0] for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE}
         pulling = self._list_pulling()
         # Whether anything pulls where a contact slips by plan, its next formation says.
         if pulling and not slipping & self.slipping:
@@ -793,7 +784,7 @@ class Replay(Run):
         """
         formation, signs = self.formation, self.signs
         if formation.n_constraints >= 4:
-            if len(turned) and self.system.is_slower(self.v, STANDING):
+            if len(turned) and self.stands:
                 # What slides does so with the one velocity; events of slow contacts come later.
                 turned = np.flatnonzero(signs).tolist()
             for row in turned:
@@ -810,7 +801,7 @@ class Replay(Run):
         ]
         if not still:
             return False
-        if self.system.is_slower(self.v, STANDING):
+        if self.stands:
             return True
         if not self.gets_on():
             names = " ".join(formation.names)
@@ -865,11 +856,10 @@ class Replay(Run):
 
     def slip(self) -> Released | Switched | Outcome:
         """End because a rolling contact slips, or starts to part where its release is planned."""
-        s, mode = self.s, self.leg.mode
-        cones = self._measure_reserves()
-        declared = [k for k in range(len(cones)) if mode.declares(k)]
-        planned = [k for k in self.find_slipping() if mode.holders[k][0] in self.slipping]
-        row = mode.holders[min(planned or declared, key=cones.__getitem__)][0]
+        s, holders, reserves = self.s, self.leg.mode.holders, self._measure_reserves()
+        out = [k for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE]
+        planned = [k for k in out if holders[k][0] in self.slipping]
+        row = holders[min(planned or reserves, key=reserves.__getitem__)][0]
         name = self.formation.names[row]
         if name in self.releasable:
             return self.let_go([row])
@@ -884,15 +874,10 @@ class Replay(Run):
         turning = self.leg.rows.turning
         return [k - turning.start for k in events if turning.start <= k < turning.stop]
 
-    def _measure_reserves(self) -> list[float]:
-        """Friction margin of contacts and joints that stick, over the scene's force or torque."""
-        reserves: list[float] = self.values[self.leg.rows.cone].reshape(2, -1).min(axis=0).tolist()
-        return reserves
-
-    def find_slipping(self) -> list[int]:
-        """Which contacts that the phase lets roll are out of their cones."""
-        reserves, mode = self._measure_reserves(), self.leg.mode
-        return [k for k, x in enumerate(reserves) if x < -ROUNDING_FORCE and mode.declares(k)]
+    def _measure_reserves(self) -> dict[int, float]:
+        """Friction margin of the forces that hold what rolls by plan, over the scene's force."""
+        reserves = self.values[self.leg.rows.cone].reshape(2, -1).min(axis=0).tolist()
+        return {k: x for k, x in enumerate(reserves) if self.leg.mode.declares(k)}
 
     def coast(self, stop: float) -> None:
         """Step to `stop`, whatever happens on the way, without a record of the forces there."""
@@ -978,10 +963,8 @@ class Replay(Run):
                 if response is None or not response.ratio > 0:
                     ratios.extend([] if response is None else [response.ratio])
                     return None
-                acceleration, rates = (
-                    response.acceleration @ load,
-                    rates + response.rates @ load / 2,
-                )
+                acceleration = response.acceleration @ load
+                rates = rates + response.rates @ load / 2
                 held = response.force_limits @ load / mode.force_limit_units
             gained = signs * rates / (speeds / scales.time)
             cones = held[count:].reshape(2, -1).min(axis=0)
@@ -1004,7 +987,5 @@ class Replay(Run):
             return max(pressing or pulling, key=lambda one: one.margin)
         if min(ratios) <= 0:
             self.fail_to_step(min(ratios))
-        names = " ".join(formation.names)
-        raise JammingError(
-            f"{names} jams {self.when()}: no combination of sliding and sticking is consistent"
-        )
+        text = f"jams {self.when()}: no combination of sliding and sticking is consistent"
+        raise JammingError(f"{' '.join(formation.names)} {text}")

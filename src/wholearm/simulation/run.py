@@ -15,7 +15,7 @@ from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
 from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
-from .system import FIRST_STEP, SHORTEST_STEP, System
+from .system import FIRST_STEP, SHORTEST_STEP, STANDING, System
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 
@@ -170,6 +170,11 @@ class Run(ABC):
     @abstractmethod
     def pass_break(self) -> Any:
         """Go on to the next piece of the torques; how that ends the motion, if it does."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether nothing moves."""
+        return self.system.is_slower(self.v, STANDING)
 
     def gets_on(self) -> bool:
         """Count a decision on contact modes; whether some time passes within 60 in a row."""

@@ -57,11 +57,8 @@ def verify_free(
     restitution  poisson's coefficient of impacts
     progress     told what is simulated
 
-    Raises
-    ------
-    InputError       if the trajectory has other contacts than the problem, or a number is out of
-                     its range
-    SimulationError  if bodies overlap at the start
+    InputError if the trajectory has other contacts than the problem, or a number is out of its
+    range; SimulationError if bodies overlap at the start.
     """
     problem, torque, plan = adopt_torques(problem, what)
     allowed = require_number(departure, "departure", positive=True)
@@ -108,10 +105,8 @@ def verify_policy(
     tolerance, restitution  as of `verify_free`
     departure               how far contacts of a phase may open, over the scene's length
 
-    Raises
-    ------
-    InputError  if the policy or the plan has other phases than the problem, or a number is out of
-                its range
+    InputError if the policy or the plan has other phases than the problem, or a number is out of
+    its range.
     """
     problem, plan = adopt_motion(problem, plan)
     allowed = require_number(departure, "departure", positive=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,9 +41,7 @@ PLACES = 33
 class Allowance:
     """What a replay may differ by from what is asked and still hold.
 
-    Raises
-    ------
-    InputError  if one of the first three is not positive, or the last is 1 or more
+    InputError if one of the first three is not positive, or the last is 1 or more.
     """
 
     # distance from the plan, over the scene's length for positions and in rad for angles
@@ -61,17 +59,6 @@ class Allowance:
     def measure_stray(self, problem: Problem) -> float:
         """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
         return 5e-7 * problem.scene.scales.force + self.stray * problem.epsilon
-
-
-def describe_overlap(
-    scene: Scene, phases: Sequence[PhaseReport], gap: FingerGap | None
-) -> list[Failure]:
-    """A sentence on links that overlap by more than passes for touching."""
-    if gap is None or gap.least >= -3e-5 * scene.scales.length:
-        return []
-    number = [phase.number for phase in phases if phase.start <= gap.time][-1]
-    text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
-    return [Failure(number, f"{text}, phase {number}")]
 
 
 def judge_end(simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
@@ -107,56 +94,66 @@ def measure_speed(scene: Scene, v: Array) -> float:
     return max(math.hypot(v[0], v[1]), length * float(np.abs(v[2:]).max()))
 
 
-def describe_speed(scene: Scene, v: Array) -> str:
-    """What moves fastest, and how fast, to follow "while"."""
-    turns = scene.scales.length * np.abs(v[2:])
-    fastest = int(turns.argmax())
-    if math.hypot(v[0], v[1]) >= turns[fastest]:
-        return f"the object moves at {math.hypot(v[0], v[1]):.3g} m/s"
-    what = ("the object", "finger 1", "finger 2")[fastest]
-    return f"{what} turns at {abs(v[2 + fastest]):.3g} rad/s"
-
-
-def describe_ends(simulation: Simulation, allowance: Allowance) -> list[Failure]:
-    """Sentences on phases that end elsewhere than pinned, or at a speed where they are to rest."""
-    problem, failures = simulation.problem, []
-    scene = problem.scene
+def describe_failures(
+    simulation: Simulation,
+    phases: Sequence[PhaseReport],
+    gap: FingerGap | None,
+    allowance: Allowance,
+) -> Iterator[Failure]:
+    """Ends elsewhere than pinned or at a speed, links that overlap, contact forces not unique."""
+    problem, scene = simulation.problem, simulation.problem.scene
     for event in simulation.find(EventKind.ARRIVAL):
         phase = problem.phases[event.phase]
         row = int(np.flatnonzero(simulation.phase == event.phase)[-1])
         z, v = simulation.z[row], simulation.z_dot[row]
         if phase.until.measure_pins(z, scene.scales.length) > allowance.departure:
             text = f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
-            failures.append(Failure(phase.number, text))
+            yield Failure(phase.number, text)
         fast = measure_speed(scene, v) > allowance.rest_speed * scene.scales.speed
         if phase.end is End.REST and fast:
-            energy = 0.5 * float(scene.mass_diagonal @ v**2)
+            speed, turns = math.hypot(v[0], v[1]), np.abs(v[2:])
+            fastest, energy = int(turns.argmax()), 0.5 * float(scene.mass_diagonal @ v**2)
+            moves = f"the object moves at {speed:.3g} m/s"
+            if scene.scales.length * turns[fastest] > speed:
+                body = ("the object", "finger 1", "finger 2")[fastest]
+                moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
             unit = "rad/s" if phase.until.coordinate == "phi" else "m/s"
             text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
-                f"{event.value:.3g} {unit} at t = {event.time:.5g} s, while "
-                f"{describe_speed(scene, v)}, with {energy:.3g} J left"
+                f"{event.value:.3g} {unit} at t = {event.time:.5g} s, while {moves}, with "
+                f"{energy:.3g} J left"
             )
-            failures.append(Failure(phase.number, text))
-    return failures
+            yield Failure(phase.number, text)
+    # More than passes for touching.
+    if gap is not None and gap.least < -3e-5 * scene.scales.length:
+        number = [phase.number for phase in phases if phase.start <= gap.time][-1]
+        text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
+        yield Failure(number, f"{text}, phase {number}")
+    for one in phases:
+        least = one.uniqueness_margin
+        # Those of a replay may be a little less than those of its plan.
+        if least is not None and least.value < allowance.uniqueness_margin - 1e-3:
+            place = describe_pose(simulation.z[np.searchsorted(simulation.t, least.time)])
+            asked = allowance.uniqueness_margin
+            text = describe_uniqueness(least.value, least.contacts, place, asked)
+            yield Failure(one.number, f"{text}, at t = {least.time:.5g} s, phase {one.number}")
 
 
 def describe_departures(
     problem: Problem, phases: Sequence[PhaseReport], allowance: Allowance
-) -> list[Failure]:
-    """The sentence on the first phase whose replay is too far from the plan, if there is one."""
-    length = problem.scene.scales.length
+) -> Iterator[Failure]:
+    """Sentences on the phases whose replay is too far from the plan."""
+    length, allowed = problem.scene.scales.length, allowance.departure
     for phase in phases:
-        worst = [d for d in (phase.deviation, phase.end_deviation) if d is not None]
-        if any(measure_departure(d, length) > allowance.departure for d in worst):
-            far = max(worst, key=lambda d: measure_departure(d, length))
+        deviations = [d for d in (phase.deviation, phase.end_deviation) if d is not None]
+        far = max(deviations, key=lambda d: measure_departure(d, length), default=None)
+        if far is not None and measure_departure(far, length) > allowed:
             text = (
                 f"phase {phase.number} departs from the plan, by {far.position:.2g} m and "
-                f"{far.angle:.2g} rad at t = {far.time:.5g} s; {allowance.departure * length:.2g} "
-                f"m and {allowance.departure:.2g} rad are allowed"
+                f"{far.angle:.2g} rad at t = {far.time:.5g} s; {allowed * length:.2g} "
+                f"m and {allowed:.2g} rad are allowed"
             )
-            return [Failure(phase.number, text)]
-    return []
+            yield Failure(phase.number, text)
 
 
 def measure_departure(deviation: Deviation, length: float) -> float:
@@ -167,38 +164,17 @@ def measure_departure(deviation: Deviation, length: float) -> float:
 
 def describe_thin_margins(
     simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
-) -> list[Failure]:
+) -> Iterator[Failure]:
     """Sentences on the normal forces below epsilon, but for contacts where they were lost."""
     problem = simulation.problem
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
-    allowed = allowance.measure_stray(problem)
-    return [
-        Failure(
-            phase.number,
-            f"c_n of {c.contact} falls to {c.least:.5g} N, below epsilon = {problem.epsilon:g} N, "
-            f"at t = {c.time:.5g} s, phase {phase.number}",
-        )
-        for phase in phases
-        for c in phase.contacts
-        if c.margin < -allowed and (phase.number, c.contact) not in lost
-    ]
-
-
-def describe_ambiguity(
-    simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
-) -> list[Failure]:
-    """Sentences on phases whose contact forces are not, or hardly, the only ones."""
-    failures = []
     for phase in phases:
-        least = phase.uniqueness_margin
-        # Those of a replay may be a little less than those of its plan.
-        if least is None or least.value >= allowance.uniqueness_margin - 1e-3:
-            continue
-        place = describe_pose(simulation.z[np.searchsorted(simulation.t, least.time)])
-        text = describe_uniqueness(least.value, least.contacts, place, allowance.uniqueness_margin)
-        text = f"{text}, at t = {least.time:.5g} s, phase {phase.number}"
-        failures.append(Failure(phase.number, text))
-    return failures
+        for c in phase.contacts:
+            thin = c.margin < -allowance.measure_stray(problem)
+            if thin and (phase.number, c.contact) not in lost:
+                text = f"below epsilon = {problem.epsilon:g} N, at t = {c.time:.5g} s"
+                text = f"c_n of {c.contact} falls to {c.least:.5g} N, {text}, phase {phase.number}"
+                yield Failure(phase.number, text)
 
 
 def find_least_force(phase: PhaseReport) -> ContactMargin | None:

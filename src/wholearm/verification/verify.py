@@ -57,10 +57,8 @@ from .verdict import (
     DEPARTURE,
     REST_SPEED,
     Allowance,
-    describe_ambiguity,
     describe_departures,
-    describe_ends,
-    describe_overlap,
+    describe_failures,
     describe_thin_margins,
     find_uniqueness_margin,
     find_wedged,
@@ -138,11 +136,8 @@ def verify(
     reduced            whether to list the paper's scalar equation of motion along phases with four
                        constraints
 
-    Raises
-    ------
-    InputError                     if the trajectory has other contacts than the problem, or a
-                                   number is out of its range
-    JammingError, SimulationError  if the simulation cannot go on
+    InputError if the trajectory has other contacts than the problem, or a number is out of its
+    range; JammingError, SimulationError if the simulation cannot go on.
     """
     if contacts == "free":
         from .free import verify_free
@@ -178,9 +173,7 @@ def observe(
     tolerance   of the simulation
     uniqueness  whether to find uniqueness margins, and static indeterminacy of starts
 
-    Raises
-    ------
-    JammingError, SimulationError  if the simulation cannot go on
+    JammingError, SimulationError if the simulation cannot go on.
     """
     if plan is None:
         times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
@@ -216,10 +209,8 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
     problem, torque = simulation.problem, simulation.torque
     reached, outcome = judge_end(simulation, allowance)
     failures = [] if reached else [Failure(len(phases), outcome)]
-    failures += describe_ends(simulation, allowance)
-    failures += describe_overlap(problem.scene, phases, gap) if reached else []
-    failures += describe_ambiguity(simulation, phases, allowance)
-    thin = describe_thin_margins(simulation, phases, allowance)
+    failures += describe_failures(simulation, phases, gap if reached else None, allowance)
+    thin = list(describe_thin_margins(simulation, phases, allowance))
     warnings = _describe_torques(problem, torque)
     warnings += [
         f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
@@ -236,7 +227,8 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         else:
             failures.append(Failure(max(number, 1), text))
     if seen.plan is not None:
-        failures += thin + describe_departures(problem, phases, allowance)
+        # The departure of later phases follows from that of the first.
+        failures += thin + list(describe_departures(problem, phases, allowance))[:1]
     else:
         warnings += [failure.text for failure in thin]
     return Report(
@@ -360,8 +352,7 @@ def _balance(simulation: Simulation) -> EnergyBalance:
     scene, energies = simulation.problem.scene, simulation.energies
     ends = simulation.z_dot[[0, -1]]
     kinetic = float(np.diff(0.5 * ends**2 @ scene.mass_diagonal)[0])
-    weight = scene.polygon.mass * scene.gravity
-    potential = float(weight * (simulation.z[-1, 1] - simulation.z[0, 1]))
+    potential = float(scene.weight * (simulation.z[-1, 1] - simulation.z[0, 1]))
     losses = {
         name: float(getattr(energies, name)[-1]) for name in ("viscous", "dry", "contact", "impact")
     }
