@@ -22,11 +22,19 @@ from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved, text_of
 from tiny_study import allow, measure, misbehave
 from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
-from wholearm.benchmark.corpus import FAMILIES, LARGEST, answer, compare, list_cases, perturb_scenes
+from wholearm.benchmark.corpus import (
+    BANDS,
+    FAMILIES,
+    LARGEST,
+    answer,
+    compare,
+    count,
+    list_cases,
+    perturb_scenes,
+)
 from wholearm.benchmark.corpus import STUDY as CORPUS
 from wholearm.benchmark.growth import SIZES, WORK, run_work
 from wholearm.benchmark.growth import STUDY as GROWTH
-from wholearm.benchmark.guard import BANDS, count, read_stored
 from wholearm.benchmark.precision import (
     FEW,
     LEAST_TIME,
@@ -121,7 +129,7 @@ def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture
         assert isinstance(study, Study) and study.name == name and study.title
         with pytest.raises(SystemExit):
             main(["bench", name, "--help"])
-        assert ("--output DIR" in capsys.readouterr().out) is study.keeps
+        assert "--output DIR" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("option", ["--scenes", "--files", "--seed", "--jobs", "--only"])
@@ -320,7 +328,6 @@ def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
     assert int(cells[5]) > int(cells[4])
 
 
-COUNTS = FOLDER.with_name("results") / "bench_guard.json"
 NODES, CONTACTS = 60, 4
 """Five nodes for each of twelve elements; sliding contacts."""
 
@@ -335,46 +342,20 @@ def test_counts_of_one_phase_are_those_of_theory() -> None:
     assert found["iterations"] > 1 and found["evaluations of the replay"] > 12
 
 
-def test_the_command_stores_counts_and_fails_where_they_grow(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, counts = str(tmp_path / "slide.toml"), tmp_path / "counts.json"
-    Path(path).write_text(text_of(), encoding="utf-8")
-    command = ["bench", "guard", path, "--counts", str(counts)]
-    assert main(command) == 2
-    assert f"{counts}: cannot be read: " in capsys.readouterr().err
-    counts.write_text('{"other": {"rows": 3}}')
-    assert main([*command, "--update"]) == 0
-    stored = read_stored(str(counts))
-    assert set(stored) == {"other", "slide"}
-    now = dict(stored["slide"])
-    rows = [((path,), {"counts": now})]
-    monkeypatch.setattr("wholearm.benchmark.study.run_all", lambda *_: rows)
-    assert main(command) == 0
-    assert "1 problems: no count has grown" in capsys.readouterr().out
-    stored["slide"]["phase 1 of 1: rows"] -= 1
-    counts.write_text(json.dumps(stored))
-    assert main(command) == 1
-    most = now["phase 1 of 1: rows"]
-    line = f"* slide: phase 1 of 1: rows has grown from {most - 1} to {most}\n"
-    assert capsys.readouterr().out.endswith(line)
-    del stored["slide"]
-    counts.write_text(json.dumps(stored))
-    assert main(command) == 1
-    assert "* slide: no counts are stored" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "text", ["[", "[]", '{"a": 3}', '{"a": {"rows": 1.5}}', '{"a": {"b": true}}']
+@each(
+    "change, text",
+    [
+        ({}, ""),
+        ({"rows": 6, "iterations": 12}, ""),
+        ({"rows": 8}, "rows has grown from 7 to 8"),
+        ({"iterations": 13}, "iterations has grown from 10 to 13 (allowed: 12)"),
+        ({"unknowns": 3}, "unknowns is counted in one of them alone"),
+    ],
 )
-def test_bad_counts_are_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "counts.json").write_text(text)
-    with pytest.raises(InputError, match=r"counts\.json"):
-        read_stored(str(tmp_path / "counts.json"))
-
-
-def test_every_problem_has_stored_counts() -> None:
-    assert set(read_stored(str(COUNTS))) == {path.stem for path in FOLDER.glob("*.toml")}
+def test_counts_may_not_grow(change: dict[str, int], text: str) -> None:
+    stored = {"rows": 7, "iterations": 10}
+    expected = ("differs", [text]) if text else ("same", [])
+    assert compare("counts", stored | change, stored) == expected
 
 
 STORED = json.loads((FOLDER.with_name("results") / "corpus.json").read_text(encoding="utf-8"))
@@ -578,15 +559,16 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
 
 def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     plan = PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
-    good = check_plan(phase(4), plan)
-    assert good.outcome == SOLVED and good.end < 1e-8
+    end, _, outcome = check_plan(phase(4), plan)
+    assert outcome == SOLVED and end < 1e-8
     weak = TorqueProfile(plan.torque.breaks, 0.98 * plan.torque.coefficients)
-    late = check_plan(phase(4), plan._replace(torque=weak))
-    assert late.end > 1e-3
+    end, *_ = check_plan(phase(4), plan._replace(torque=weak))
+    assert end > 1e-3
     none = np.zeros_like(plan.torque.coefficients)
-    lost = check_plan(phase(4), plan._replace(torque=TorqueProfile(plan.torque.breaks, none)))
-    assert "contact is lost" in lost.outcome and lost.violation > 0.02
-    assert check_plan(phase(4), plan._replace(status="stopped")).outcome == "stopped"
+    zero = TorqueProfile(plan.torque.breaks, none)
+    _, violation, outcome = check_plan(phase(4), plan._replace(torque=zero))
+    assert "contact is lost" in outcome and violation > 0.02
+    assert check_plan(phase(4), plan._replace(status="stopped"))[2] == "stopped"
 
 
 def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str]) -> None:

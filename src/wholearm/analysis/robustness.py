@@ -345,13 +345,13 @@ def make_trial(
     begin = float(starts[first])
     windows = tuple(
         TimeWindow(
-            planned_phase.number,
-            float(starts[planned_phase.index + 1]) - begin,
-            tuple(planned_phase.formation.names),
-            "" if planned_phase.until.contact is None else planned_phase.until.contact.name,
-            aliases=list_aliases(problem, planned_phase),
+            part.number,
+            float(starts[part.index + 1]) - begin,
+            tuple(part.formation.names),
+            "" if part.until.contact is None else part.until.contact.name,
+            aliases=list_aliases(problem, part),
         )
-        for planned_phase in problem.phases[first : last + 1]
+        for part in problem.phases[first : last + 1]
     )
     torque = plan.torque.cut(begin, float(starts[last + 1]))
     torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
@@ -424,20 +424,17 @@ class Robustness(Result):
         ended = Counter(record["ended"] for record in self.records if record["ended"])
         rows = []
         for sensitivity in least.of:
-            width = (
-                f"{sensitivity.width:g} {sensitivity.unit}"
-                if sensitivity.unit
-                else f"{100 * sensitivity.width:g} %"
-            )
-            slope = f"{sensitivity.slope:.5g} N{'/' + sensitivity.unit if sensitivity.unit else ''}"
-            slope = slope if sensitivity.slope == sensitivity.slope else "a contact is lost at once"
+            unit, change = sensitivity.unit, sensitivity.width
+            width = f"{change:g} {unit}" if unit else f"{100 * change:g} %"
+            slope = f"{sensitivity.slope:.5g} N{f'/{unit}' if unit else ''}"
+            slope = "a contact is lost at once" if math.isnan(sensitivity.slope) else slope
             rows.append((sensitivity.name, width, slope, sensitivity.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
         end, missed = self.nominal, ""
-        if not end["reached"]:
+        if not end["reached"] and "distance" in end:
+            missed = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
+        elif not end["reached"]:
             missed = str(end["ended"])
-            if "distance" in end:
-                missed = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
         place_of = f" on {least.contact} at t = {least.time:.4g} s"
         return Document(
             f"{trial.problem.name}, {place}",
@@ -454,7 +451,7 @@ class Robustness(Result):
 
     @property
     def values(self) -> dict[str, Any]:
-        """Counts, shares and sensitivities, as JSON has them."""
+        """Counts, shares and sensitivities."""
         trial, least = self.trial, self.sensitivities
         keys = ("parameter", "unit", "range", "slope")
         return {
@@ -468,9 +465,7 @@ class Robustness(Result):
             "kept": self.kept.table,
             "first_lost": {name: share.table for name, share in self.first_lost.items()},
             "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
-            "sensitivities": [
-                dict(zip(keys, sensitivity, strict=True)) for sensitivity in least.of
-            ],
+            "sensitivities": [dict(zip(keys, one, strict=True)) for one in least.of],
             "nominal": {key: entry for key, entry in self.nominal.items() if key != "path"},
         }
 
@@ -524,8 +519,8 @@ def assess_robustness(
         outcomes = {k: record for k, record in stored.items() if k < samples}
         # Latin hypercubes one after another: one more each time that the study is enlarged.
         starts = [sum(sizes[:k]) for k in range(len(sizes))]
-        parts = zip(starts, sizes, strict=True)
-        cubes = [trial_uncertainty.draw(size, (seed, k) if k else seed) for k, size in parts]
+        seeds = [(seed, k) if k else seed for k in starts]
+        cubes = [trial_uncertainty.draw(*part) for part in zip(sizes, seeds, strict=True)]
         drawn = np.vstack(cubes)[:samples]
         tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in outcomes)
         good = sum(record["reached"] for record in outcomes.values())
@@ -608,11 +603,7 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
         forces = [_find_force(trial, parameter.name, value, contact, time) for value in ends]
         slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
         sensitivities.append(Sensitivity(parameter.name, parameter.unit, width, slope))
-    sensitivities.sort(
-        key=lambda sensitivity: (
-            math.inf if math.isnan(sensitivity.slope) else -abs(sensitivity.over_range)
-        )
-    )
+    sensitivities.sort(key=lambda one: np.nan_to_num(-abs(one.over_range), nan=math.inf))
     return Sensitivities(contact, time, least, tuple(sensitivities))
 
 

@@ -424,19 +424,17 @@ def make_course(instance: Instance, study: str) -> Course | None:
     return Course(problem, torque, spans, end)
 
 
-class ReferenceCheck(NamedTuple):
-    """What a replay has shown."""
+def check_plan(instance: Instance, plan: PeerPlan) -> tuple[float, float, str]:
+    """Replay a plan.
 
-    end: float  # error of the end state, relative to the scene
-    # worst violation of c_n >= epsilon, over the scene's force, or of a torque limit, over it
-    violation: float
-    outcome: str  # `SOLVED`, or why the plan is none
-
-
-def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
-    """Replay a plan."""
+    Returns
+    -------
+    end        error of the end state, relative to the scene
+    violation  worst of c_n >= epsilon, over the scene's force, or of a torque limit, over it
+    outcome    `SOLVED`, or why the plan is none
+    """
     if plan.status != SOLVED:
-        return ReferenceCheck(math.nan, math.nan, plan.status)
+        return math.nan, math.nan, plan.status
     problem, curve = instance.problem, instance.curve
     reversals = len(curve.segments) - 1
     state, _, least = integrate(problem, plan.torque, curve, reversals, 1e-10)
@@ -452,7 +450,7 @@ def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
         (excess <= 1e-2, "a torque limit is missed between nodes"),
     )
     outcome = next((text for holds, text in tests if not holds), SOLVED)
-    return ReferenceCheck(end, violation, outcome)
+    return end, violation, outcome
 
 
 def build_plant(formation: Formation) -> Expression:
@@ -779,65 +777,45 @@ weight or the torque limit.
 """
 
 
-class PeerComparison(NamedTuple):
-    """What one table compares."""
-
-    study: str
-    title: str
-    ours: str  # method that others are compared with
-    targets: tuple[float, ...]  # errors that run times are compared at
-    building: bool  # whether the time to build counts
-    errors: int | None  # how many of the errors have to be below a target; None for all
-
-
-COMPARISONS = (
-    *(
-        PeerComparison(study, study, "wholearm", (1e-6, 1e-9, 1e-11), False, None)
-        for study in SIMULATION
-    ),
-    *(
-        PeerComparison(
-            study, f"{study}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count
-        )
-        for study in PLANNING
-        for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
-    ),
+TARGETS = dict.fromkeys(SIMULATION, (1e-6, 1e-9, 1e-11)) | dict.fromkeys(
+    PLANNING, (1e-2, 1e-3, 1e-4)
 )
-"""Tables of times at equal error."""
+"""Errors at which run times are compared, by study."""
 
 
-def find_times(
-    rows: Sequence[Row], method: str, own: PeerComparison, target: float
-) -> dict[str, float]:
-    """Times in which a method reaches an error on each phase that it has runs on [s].
+def _group(rows: Sequence[Row], study: str) -> dict[str, list[Row]]:
+    """Rows of a study by method, in the order of methods."""
+    mine = [row for row in rows if row["study"] == study]
+    groups = {name: [row for row in mine if row["method"] == name] for name in METHODS}
+    return {name: group for name, group in groups.items() if group}
 
-    Infinite where it does not.
+
+def _find_times(rows: Sequence[Row], target: float, count: int | None) -> dict[str, float]:
+    """Least times in which a method reaches an error on each phase [s]; infinite without any.
+
+    With planners the time to build counts; `count` of their errors have to be small, or all.
     """
     times: dict[str, float] = {}
     for row in rows:
-        if (row["study"], row["method"]) == (own.study, method):
-            error = max(map(abs, row["errors"][: own.errors]))
-            took = row["solve"] + own.building * row["build"]
-            reached = took if row["outcome"] == SOLVED and error <= target else math.inf
-            times[row["phase"]] = min(times.get(row["phase"], math.inf), reached)
+        error = max(map(abs, row["errors"][:count]))
+        took = row["solve"] + (row["build"] if row["study"] in PLANNING else 0.0)
+        reached = took if row["outcome"] == SOLVED and error <= target else math.inf
+        times[row["phase"]] = min(times.get(row["phase"], math.inf), reached)
     return times
 
 
-def list_methods(rows: Sequence[Row], study: str) -> list[str]:
-    """Methods that a study has runs of, in their order."""
-    methods = {row["method"] for row in rows if row["study"] == study}
-    return [name for name in METHODS if name in methods]
-
-
-def _format_targets(rows: Sequence[Row], own: PeerComparison, limit: float) -> list[str]:
+def _format_targets(
+    rows: Sequence[Row], study: str, title: str, count: int | None, limit: float
+) -> list[str]:
     """Times to reach errors, and how many times as long as ours that is."""
-    methods, table = list_methods(rows, own.study), []
-    if own.ours not in methods:
+    groups, table = _group(rows, study), []
+    own = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
+    if own is None:
         return []
-    for method in methods:
+    for method, group in groups.items():
         cells = [method]
-        for target in own.targets:
-            times, ours = (find_times(rows, m, own, target) for m in (method, own.ours))
+        for target in TARGETS[study]:
+            times, ours = (_find_times(part, target, count) for part in (group, own))
             names = times.keys() & ours.keys()
             reached = sum(math.isfinite(times[name]) for name in names)
             mean, least = (
@@ -847,21 +825,16 @@ def _format_targets(rows: Sequence[Row], own: PeerComparison, limit: float) -> l
             shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
             cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
         table.append(cells)
-    heads = [head for t in own.targets for head in (f"{t:g} [s]", "reached", "times ours")]
-    return [
-        f"## {own.title[0].upper()}{own.title[1:]}",
-        "",
-        *format_table(["method", *heads], table),
-        "",
-    ]
+    heads = [head for t in TARGETS[study] for head in (f"{t:g} [s]", "reached", "times ours")]
+    title = f"## {study[0].upper()}{study[1:]}{title}"
+    return [title, "", *format_table(["method", *heads], table), ""]
 
 
 def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
     """One panel; hollow markers are settings with which some phases are not solved."""
     planning = study in PLANNING
-    for index, method in enumerate(list_methods(rows, study)):
+    for index, (method, mine) in enumerate(_group(rows, study).items()):
         points, full = [], []
-        mine = [row for row in rows if (row["study"], row["method"]) == (study, method)]
         for setting in dict.fromkeys(row["setting"] for row in mine):
             group = [row for row in mine if row["setting"] == setting]
             finite_rows = [row for row in group if np.isfinite(row["errors"][0])]
@@ -933,8 +906,12 @@ class Precision(Study):
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """All tables."""
         lines, measured = [INTRODUCTION], [row for row in rows if "errors" in row]
-        for comparison in COMPARISONS:
-            lines += _format_targets(measured, comparison, options.limit)
+        for study in SIMULATION:
+            lines += _format_targets(measured, study, "", None, options.limit)
+        for study in PLANNING:
+            title = ", by the error of the phase time"
+            lines += _format_targets(measured, study, title, 1, options.limit)
+            lines += _format_targets(measured, study, ", by all three errors", None, options.limit)
         table = [(name, method.settings) for name, method in METHODS.items()]
         lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
         return "\n".join(lines), []

@@ -4,6 +4,11 @@ A query has a start and a goal, each an edge on the palm and an x at which both 
 object, drawn at random for the shipped scenes and for random polygons in the hexagon's hand. Each
 query is asked twice: first of a scene that nothing is known of, then for a goal a little further
 on, with what is known. `draw_leg` draws routes that need no search.
+
+With ``--ways`` the phases that `route` prints take the place of the goal. They are planned as they
+are, over time, with limited rates, control periods and dwell, and a policy of the plan is simulated
+without given contacts. Counted is what has a plan, how far its objective is from that of the route,
+and the processor time over that of planning the printed phases.
 """
 
 from __future__ import annotations
@@ -21,45 +26,53 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InfeasibleError, InputError, WholearmError
+from ..common.fields import choice
 from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
+from ..planning.plan import solve
+from ..policy.make import make_policy
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
+from ..results.trajectory import Trajectory
 from ..search.find_route import Answer, find_route, forget_roadmaps
+from ..verification.free import verify_policy
 from ..verification.verify import verify
 from .scenes import Table
 from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
+SAME = 1e-4  # relative difference of values of plans that count as the same
+RATE = 250.0  # limit of torque rates over that of torques [1/s]
+WAYS = ("printed", "time", "rates", "period", "dwell", "policy")
 
 
 class Queries(Study):
-    """Queries, and second ones on the same map."""
+    """Queries, second ones on the same map, and routes carried out."""
 
     name, title = "queries", "From pose to pose"
     shipped = seeded = True
-    options = """\
+    options = f"""\
 --queries N   how many = 250 in 0..100000
 --polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..100000
 --objective NAME  of the plans: time, effort or margin = time
+--ways WAY ...  carry routes out, too: {", ".join(WAYS)}
 """
 
-    def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
-        """Seed and objective."""
-        return {key: getattr(options, key) for key in ("seed", "objective")}
-
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """What is drawn, its seed and number, folder of the problems, and the objective."""
+        """What is drawn, its seed and number, folder of the problems, objective, and ways."""
         objective = PlanOptions(objective=options.objective).goal.value
+        ways = tuple(choice(*WAYS).read(way, "--ways") for way in options.ways)
+        asked = options.problems, objective, ways
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
-            yield from ((kind, options.seed, k, options.problems, objective) for k in range(count))
+            yield from ((kind, options.seed, k, *asked) for k in range(count))
 
     def limit(self, case: Case) -> float:
-        """Two searches."""
-        return 600.0
+        """Two searches, and the plans."""
+        return 1800.0 if case[-1] else 600.0
 
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one."""
+        *_, objective, ways = case
         problem, answer, row = ask_route(case)
         if answer is None:
             return row
@@ -71,9 +84,9 @@ class Queries(Study):
         goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
         further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
         with suppress(WholearmError):
-            find_route(problem.with_({"goal": further}), case[4])
+            find_route(problem.with_({"goal": further}), objective)
             row["second"] = time.process_time() - started
-        return row | {"kind": "solved"}
+        return row | {"kind": "solved"} | (_carry_out(problem, answer, ways) if ways else {})
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What came of them, and the times."""
@@ -97,11 +110,76 @@ class Queries(Study):
         if gaps:
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
             lines += [f"{text}, median {100 * np.median(gaps):.2g} %."]
+        solved = [row["ways"] for row in rows if "ways" in row]
+        if solved:
+            heads = ["", "carried out", "objective off: median", "most", "time: median", "95 %"]
+            lines += ["", *format_table(heads, filter(None, (_sum_up(w, solved) for w in WAYS)))]
+            lines += ["", "Refused:", ""]
+        for row in rows:
+            parts = row.get("ways", {}).items()
+            lines += [f"* {row['text']}, {w}: {p['why'][:300]}" for w, p in parts if p.get("why")]
         wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
 
 STUDY = Queries()
+
+
+def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
+    """The phases that a route prints, planned and carried out in the ways that are asked for."""
+    row: Row = {"ways": {}}
+    table = {key: entry for key, entry in problem.table.items() if key != "goal"}
+    objective, printed = answer.plan.options.goal, None
+    limit = RATE * min(finger.torque_limit for finger in problem.scene.fingers)
+    changes: dict[str, dict[str, Any]] = {
+        "time": {},
+        "rates": {"torque_rate_limit": limit},
+        "period": {"control_period": 2e-3},
+        "dwell": {"settle": "10 %"},
+    }
+    for way in dict.fromkeys(["printed", *ways]):
+        started = time.process_time()
+        part: Row = {}
+        try:
+            if printed is None:
+                printed = solve(build_problem(table | tomllib.loads(answer.to_text())), objective)
+                part["off"] = printed.value / answer.plan.value - 1
+            elif way == "policy":
+                policy = make_policy(printed.problem, printed.trajectory, planner=_plan_anew)
+                report = verify_policy(printed.problem, printed.trajectory, policy)
+                part["why"] = "; ".join(report.failures)
+            else:
+                transcription = "time" if way == "time" else "auto"
+                changed = printed.problem.with_(changes[way])
+                plan = solve(changed, objective, transcription=transcription)
+                part["off"] = plan.value / printed.value - 1
+        except WholearmError as error:
+            part["why"] = str(error)
+        row["ways"][way] = part | {"seconds": time.process_time() - started}
+        if printed is None:
+            return row | {"findings": [f"as printed: {part['why']}"]}
+    if abs(off := row["ways"]["printed"]["off"]) > SAME:
+        row["findings"] = [f"as printed: off by {off:.2g}"]
+    return row
+
+
+def _plan_anew(problem: Problem) -> Trajectory:
+    """What a policy plans anew, as the command `policy` does."""
+    return solve(problem, replay=False).trajectory
+
+
+def _sum_up(way: str, solved: Sequence[Row]) -> list[str] | None:
+    """How many routes are carried out in a way, how far off, and in which time."""
+    parts = [ways for ways in solved if way in ways]
+    good = [ways for ways in parts if not ways[way].get("why")]
+    off = [ways[way]["off"] for ways in good if "off" in ways[way]]
+    cells = [way, f"{len(good)} of {len(parts)}", *"----"]
+    if off:
+        cells[2:4] = (f"{value:.2g}" for value in (np.median(off), max(off, key=abs)))
+    if good:
+        ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in good]
+        cells[4:] = (f"{value:.2f}" for value in np.percentile(ratios, [50, 95]))
+    return cells if parts else None
 
 
 def draw_query(seed: int, number: int, folder: Path) -> Problem:
@@ -138,9 +216,9 @@ DRAW = {"query": draw_query, "polygon": draw_polygon_query}
 def ask_route(case: Case) -> tuple[Problem, Answer | None, Row]:
     """A problem with a goal, its route, if any, and a row with processor time or reason.
 
-    The case has what is drawn, its seed and number, folder of the problems, and the objective.
+    The case begins with what is drawn, its seed and number, folder of the problems, and objective.
     """
-    drawn, seed, number, folder, objective = case
+    drawn, seed, number, folder, objective, *_ = case
     problem = DRAW[drawn](seed, number, Path(folder))
     forget_roadmaps()
     row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}

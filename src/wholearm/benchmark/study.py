@@ -53,7 +53,6 @@ class Study:
     ----------
     name          of its files: ``bench_NAME.jsonl``, ``.md`` and ``.csv``
     title         of the table
-    keeps         whether records are kept, and the table is written
     folder        where, if the command line does not say
     of_code       whether records count for the source code and the machine alone that they were
                   made with
@@ -61,19 +60,16 @@ class Study:
     strict        whether warnings are errors
     shipped       whether it reads a folder of problem files
     seeded        whether cases are drawn from a seed
-    stored        option and default of a file of stored answers, if answers are compared with them
     """
 
     name = ""
     title = ""
-    keeps = True
     folder = "results"
     of_code = False
     timed = False
     alone = False
     strict = False
     shipped = seeded = False
-    stored: tuple[str, str] | None = None
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
     packages: tuple[str, ...] = ()  # further ones whose versions are stated
 
@@ -88,14 +84,9 @@ class Study:
             parts.append("--problems DIR  folder of problem files = problems\n")
         if self.seeded:
             parts.append(f"--seed K  of everything drawn = 0 in 0..{2**63}\n")
-        if self.stored:
-            option, path = self.stored
-            parts.append(f"{option} FILE  of what is stored = {path}\n")
-            parts.append("--update  store what is found now\n")
-        if self.keeps:
-            parts.append("--fresh  run all cases anew, whatever records the folder has\n")
-            parts.append("--again  run again the cases that had findings\n")
-            parts.append(f"-o --output DIR  folder for records and tables = {self.folder}\n")
+        parts.append("--fresh  run all cases anew, whatever records the folder has\n")
+        parts.append("--again  run again the cases that had findings\n")
+        parts.append(f"-o --output DIR  folder for records and tables = {self.folder}\n")
         return "".join(parts)
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
@@ -140,20 +131,18 @@ def run_study(
     Returns its text, what must not be, and the files it has written.
     """
     cases = list(dict.fromkeys(study.list_cases(options)))
-    stem, path, stamp, fresh, again = "", os.devnull, dict[str, Any](), False, False
-    if study.keeps:
-        make_folder(options.output)
-        stem = os.path.join(options.output, f"bench_{study.name}")
-        stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
-        path, fresh, again = f"{stem}.jsonl", options.fresh, options.again
-        if study.of_code:
-            stamp["source"] = digest_source(study.list_inputs(options))
-            # Records of other code are no records; what is no study of this kind is left alone.
-            with suppress(OSError, ValueError, TypeError), open(path, encoding="utf-8") as stream:
-                header = dict(json.loads(stream.readline()))
-                same = header.get("source") == stamp["source"]
-                fresh = fresh or (header.get("study") == study.name and not same)
-    with Journal(path, stamp, fresh, again) as journal:
+    make_folder(options.output)
+    stem, fresh = os.path.join(options.output, f"bench_{study.name}"), options.fresh
+    path, stamp = f"{stem}.jsonl", {"study": study.name, "version": __version__}
+    stamp |= study.stamp(options)
+    if study.of_code:
+        stamp["source"] = digest_source(study.list_inputs(options))
+        # Records of other code are no records; what is no study of this kind is left alone.
+        with suppress(OSError, ValueError, TypeError), open(path, encoding="utf-8") as stream:
+            header = dict(json.loads(stream.readline()))
+            same = header.get("source") == stamp["source"]
+            fresh = fresh or (header.get("study") == study.name and not same)
+    with Journal(path, stamp, fresh, options.again) as journal:
         done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]
         wall_start, wrong = time.monotonic(), 0
@@ -181,8 +170,6 @@ def run_study(
     if findings:
         parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
     text = "\n\n".join(parts) + "\n"
-    if not study.keeps:
-        return text, findings, []
     written = [f"{stem}.md"]
     with together():
         write_text(written[0], text)

@@ -1,4 +1,7 @@
-"""Replays in Drake, with its point contact model and the TAMSI solver."""
+"""Replays in Drake, with its point contact model and the TAMSI solver.
+
+`engine_replay.require_engine` imports this module where Drake is installed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from pydrake import geometry, trajectories
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody import plant as multibody
+from pydrake.multibody import tree
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
 
 from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
@@ -39,12 +49,7 @@ _EVERY = 4  # Steps from one look at the forces to the next: contacts swing ten 
 def play(
     problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
 ) -> EngineRun:
-    """Replay a stretch in Drake; an `Engine`.
-
-    ImportError if Drake is not installed.
-    """
-    from pydrake.systems.analysis import Simulator
-
+    """Replay a stretch in Drake; an `Engine`."""
     steps, drive = list_steps(problem, stretch, torque, setting.step), None
     if isinstance(torque, ClosedLoop):
         drive = EngineDrive(problem.scene, torque, _EVERY * steps.h)
@@ -105,20 +110,11 @@ def _build(
 
     If it `plays`, the torques of the steps are part of it.
     """
-    from pydrake.multibody.plant import (
-        AddMultibodyPlantSceneGraph,
-        ContactModel,
-        DiscreteContactApproximation,
-    )
-    from pydrake.systems.framework import DiagramBuilder
-    from pydrake.systems.primitives import TrajectorySource
-    from pydrake.trajectories import PiecewisePolynomial
-
     builder = DiagramBuilder()
-    plant, graph = AddMultibodyPlantSceneGraph(builder, steps.h)
+    plant, graph = multibody.AddMultibodyPlantSceneGraph(builder, steps.h)
     # The default approximation, lagged, is wrong by millimetres here; TAMSI converges.
-    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
-    plant.set_contact_model(ContactModel.kPoint)
+    plant.set_discrete_contact_approximation(multibody.DiscreteContactApproximation.kTamsi)
+    plant.set_contact_model(multibody.ContactModel.kPoint)
     _add_bodies(plant, scene)
     pairs = _add_shapes(plant, graph, scene, setting)
     plant.Finalize()
@@ -128,64 +124,51 @@ def _build(
     # Held from half a step before each step on, so that rounding of times does not matter.
     breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
     rows = np.vstack([steps.tau, steps.tau[-1:]]).T
-    source = builder.AddSystem(TrajectorySource(PiecewisePolynomial.ZeroOrderHold(breaks, rows)))
+    torques = trajectories.PiecewisePolynomial.ZeroOrderHold(breaks, rows)
+    source = builder.AddSystem(TrajectorySource(torques))
     builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
     return builder.Build(), plant, pairs
 
 
 def _add_bodies(plant: Any, scene: Scene) -> None:
     """Object and links, whose weight is no part of the model, on their joints."""
-    from pydrake.math import RigidTransform
-    from pydrake.multibody.tree import (
-        FixedOffsetFrame,
-        PlanarJoint,
-        RevoluteJoint,
-        SpatialInertia,
-        UnitInertia,
-    )
 
     def add(name: str, mass: float, inertia: float) -> Any:
-        unit = UnitInertia(*3 * [inertia / mass])
-        return plant.AddRigidBody(name, SpatialInertia(mass, np.zeros(3), unit))
+        unit = tree.UnitInertia(*3 * [inertia / mass])
+        return plant.AddRigidBody(name, tree.SpatialInertia(mass, np.zeros(3), unit))
 
     polygon = scene.polygon
     assert polygon.inertia is not None
     body = add(OBJECT, polygon.mass, polygon.inertia)
-    plant.AddJoint(PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
+    plant.AddJoint(tree.PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
     for name, link in zip(LINKS, scene.fingers, strict=True):
         link_body = add(name, link.inertia / link.length**2, link.inertia)
         place = RigidTransform([*np.asarray(link.base), 0.0])
-        base = plant.AddFrame(FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
-        turn = RevoluteJoint(name, base, link_body.body_frame(), [0.0, 0.0, 1.0], link.viscous)
+        base = plant.AddFrame(tree.FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
+        frames = base, link_body.body_frame()
+        turn = tree.RevoluteJoint(name, *frames, [0.0, 0.0, 1.0], link.viscous)
         plant.AddJointActuator(name, plant.AddJoint(turn))
     plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
 
 
 def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[Any, int]:
     """Add balls, capsules and the palm; only pairs that may touch are looked at."""
-    from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, HalfSpace
-    from pydrake.math import RigidTransform, RotationMatrix
-
     shapes = {shape.name: shape for shape in list_shapes(scene)}
     geometry_ids: dict[tuple[str, float], Any] = {}
 
     def register(name: str, friction: float) -> Any:
         key = (name, friction)
         if key not in geometry_ids:
-            material = _make_material(scene, setting, friction)
-            label = f"{name} {friction:g}"
             if name == PALM:
                 low = [0.0, -find_rounding(scene), 0.0]
                 place = RigidTransform(RotationMatrix.MakeXRotation(-np.pi / 2), low)
-                geometry_ids[key] = plant.RegisterCollisionGeometry(
-                    plant.world_body(), place, HalfSpace(), label, material
-                )
+                body, form = plant.world_body(), geometry.HalfSpace()
             else:
-                place, form = _place(shapes[name])
-                body = plant.GetBodyByName(shapes[name].body)
-                geometry_ids[key] = plant.RegisterCollisionGeometry(
-                    body, place, form, label, material
-                )
+                body, (place, form) = plant.GetBodyByName(shapes[name].body), _place(shapes[name])
+            material = _make_material(scene, setting, friction)
+            geometry_ids[key] = plant.RegisterCollisionGeometry(
+                body, place, form, f"{name} {friction:g}", material
+            )
         return geometry_ids[key]
 
     numbers = {}
@@ -195,12 +178,11 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
         ids = [register(pair.first, one), register(pair.second, two)]
         numbers[frozenset(ids)] = number
     manager = graph.collision_filter_manager()
-    manager.Apply(
-        CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(geometry_ids.values())))
-    )
-    allowed = CollisionFilterDeclaration()
+    every = geometry.GeometrySet(list(geometry_ids.values()))
+    manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(every))
+    allowed = geometry.CollisionFilterDeclaration()
     for first, second in numbers:
-        allowed.AllowBetween(GeometrySet(first), GeometrySet(second))
+        allowed.AllowBetween(geometry.GeometrySet(first), geometry.GeometrySet(second))
     manager.Apply(allowed)
     return numbers
 
@@ -212,28 +194,22 @@ def _find_stiffness(scene: Scene, setting: Setting) -> float:
 
 def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
     """Twice the stiffness of a pair, for both of its shapes."""
-    from pydrake.geometry import AddContactMaterial, ProximityProperties
-    from pydrake.multibody.plant import CoulombFriction
-
-    material = ProximityProperties()
-    AddContactMaterial(
+    material = geometry.ProximityProperties()
+    geometry.AddContactMaterial(
         material,
         dissipation=1000.0 / scene.scales.speed,
         point_stiffness=2 * _find_stiffness(scene, setting),
-        friction=CoulombFriction(friction, friction),
+        friction=multibody.CoulombFriction(friction, friction),
     )
     return material
 
 
 def _place(shape: Shape) -> tuple[Any, Any]:
     """A ball or a capsule, and where it is on its body."""
-    from pydrake.geometry import Capsule, Sphere
-    from pydrake.math import RigidTransform, RotationMatrix
-
     middle = [*shape.points.mean(axis=0), 0.0]
     if len(shape.points) == 1:
-        return RigidTransform(middle), Sphere(shape.radius)
+        return RigidTransform(middle), geometry.Sphere(shape.radius)
     run = shape.points[1] - shape.points[0]
     length = float(np.hypot(*run))
     turn = RotationMatrix.MakeFromOneVector([*(run / length), 0.0], 2)
-    return RigidTransform(turn, middle), Capsule(shape.radius, length)
+    return RigidTransform(turn, middle), geometry.Capsule(shape.radius, length)

@@ -14,25 +14,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from ..common.errors import SimulationError
 from ..common.sharing import exclusive
+from . import style
 from .plots import draw_margins, draw_phases
 from .snapshots import place_vertices, trace_link
-from .style import (
-    FINGERS,
-    GRID,
-    INK,
-    LINES,
-    LOST,
-    LOW,
-    PALETTE,
-    PALM,
-    choose_styles,
-    inset,
-    list_contacts,
-    open_figure,
-    unit_of,
-    write,
-    write_title,
-)
 
 if TYPE_CHECKING:
     from ..analysis.comparison import Comparison, Contender
@@ -42,9 +26,9 @@ if TYPE_CHECKING:
 
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
-    ("contacts kept too", PALETTE[2], "o"),
-    ("goal reached", PALETTE[0], "s"),
-    ("goal missed", PALETTE[6], "x"),
+    ("contacts kept too", style.PALETTE[2], "o"),
+    ("goal reached", style.PALETTE[0], "s"),
+    ("goal missed", style.PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
 
@@ -62,7 +46,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
             motion = None if contender.report is None else contender.report.trajectory
         shown.append((contender, motion))
     motions = [motion for _, motion in shown if motion is not None]
-    styles = choose_styles(
+    styles = style.choose_styles(
         tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     )
     longest = max((motion.duration for motion in motions), default=1.0)
@@ -72,10 +56,10 @@ def draw_comparison(comparison: Comparison) -> Figure:
     covered = np.concatenate(
         [[0.0], *(motion.c_n.ravel() - comparison.epsilon for motion in motions)]
     )
-    with open_figure(10.0, high) as figure:
+    with style.open_figure(10.0, high) as figure:
         title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
-        write_title(figure, title)
-        look: Any = {"fontsize": 9, "color": INK, "parse_math": False, "va": "bottom"}
+        style.write_title(figure, title)
+        look: Any = {"fontsize": 9, "color": style.INK, "parse_math": False, "va": "bottom"}
         look["transform"] = figure.dpi_scale_trans
         high -= 0.35
         for contender, motion in shown:
@@ -88,13 +72,13 @@ def draw_comparison(comparison: Comparison) -> Figure:
             if motion is None:
                 continue
             high -= tall + line
-            axes = inset(figure, left, high, 10.0 - left - right, tall)
+            axes = style.inset(figure, left, high, 10.0 - left - right, tall)
             high -= 0.4
             draw_margins(axes, motion, comparison.epsilon, styles, covered)
             axes.set_xlim(0.0, longest)
             draw_phases(axes, motion.phase_starts, span=longest)
-            list_contacts(axes, 72 * tall)
-            axes.set_ylabel(f"$c_n - \\varepsilon$ {unit_of(axes)}")
+            style.list_contacts(axes, 72 * tall)
+            axes.set_ylabel(f"$c_n - \\varepsilon$ {style.unit_of(axes)}")
             axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
     return figure
 
@@ -107,16 +91,16 @@ def draw_prediction(prediction: Prediction) -> Figure:
     rows = max(math.ceil(len(phases) / columns), 1)
     # Size of a panel with what is written about it, and the room that this takes [in].
     (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
-    with open_figure(columns * wide, rows * tall + 0.45) as figure:
+    with style.open_figure(columns * wide, rows * tall + 0.45) as figure:
         for k, phase in enumerate(phases):
             row, column = divmod(k, columns)
             corner = column * wide + left, (rows - 1 - row) * tall + bottom
-            axes = inset(figure, *corner, wide - left - right, tall - bottom - top)
+            axes = style.inset(figure, *corner, wide - left - right, tall - bottom - top)
             _draw_phase(axes, phase, prediction.epsilon)
             axes.set_ylabel("least $c_n$ [N]" if column == 0 else "")
             axes.set_xlabel("speed along the phase [m/s]" if k >= len(phases) - columns else "")
         name = f"{prediction.name}{_DOT}quasistatic motions at speed"
-        write_title(figure, f"{name}{_DOT}\u03b5 = {prediction.epsilon:g} N", left=0.15)
+        style.write_title(figure, f"{name}{_DOT}\u03b5 = {prediction.epsilon:g} N", left=0.15)
     return figure
 
 
@@ -126,31 +110,32 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     assert curves is not None
     rest = max([epsilon, *(float(force[0]) for force in curves.force.values())])
     low, high = -0.35 * rest, 2.2 * rest
-    axes.axhspan(0.0, epsilon, color=LOW, linewidth=0, zorder=1)
-    axes.axhspan(low, 0.0, color=LOST, linewidth=0, zorder=1)
+    axes.axhspan(0.0, epsilon, color=style.LOW, linewidth=0, zorder=1)
+    axes.axhspan(low, 0.0, color=style.LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
     above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom", "fontsize": 7.5}
     for k, survival in enumerate(phase.survivals):
-        look: Any = {"color": PALETTE[k], "linestyle": LINES[k % 3][0], "linewidth": 1.9}
+        colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
+        look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
         force = curves.force[survival.motion]
         axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
         if survival.speed:
-            axes.plot(survival.speed, epsilon, "o", color=PALETTE[k], markersize=5, zorder=6)
+            axes.plot(survival.speed, epsilon, "o", color=colour, markersize=5, zorder=6)
         text = f"{survival.motion}, {_name_failure(survival)}"
-        write(axes, text, (0, 1), (0, 29 - 12 * k), color=PALETTE[k], **above)
+        style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **above)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
-        axes.text(0.5, 0.8, "no slow motion keeps its limits", color=INK, **middle)
+        axes.text(0.5, 0.8, "no slow motion keeps its limits", color=style.INK, **middle)
     title = f"phase {phase.number}, until {phase.until}"
     above |= {"fontsize": 9, "fontweight": "bold"}
-    write(axes, title, (0, 1), (0, 41), color=INK, **above)
+    style.write(axes, title, (0, 1), (0, 41), color=style.INK, **above)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
     wide = curves.speed[-1] > 20.0 * curves.speed[0]
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if wide else (1.0, 2.0, 3.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.grid(color=GRID, linewidth=0.4)
+    axes.grid(color=style.GRID, linewidth=0.4)
 
 
 def _name_failure(own: Survival) -> str:
@@ -173,7 +158,7 @@ def draw_robustness(study: Robustness) -> Figure:
     Figure  axes in the order: hand and paths of the centroid, to scale; distances and angles from
             the goal
     """
-    with open_figure(10.0, 4.6, layout="constrained") as figure:
+    with style.open_figure(10.0, 4.6, layout="constrained") as figure:
         motion, ends = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
         _draw_motion(motion, study)
         _draw_ends(ends, study)
@@ -188,7 +173,9 @@ def find_kind(record: dict[str, Any]) -> int:
 def _draw_motion(axes: Axes, study: Robustness) -> None:
     scene, nominal = study.trial.problem.scene, np.array(study.nominal["path"])
     axes.set_aspect("equal", adjustable="box")
-    for finger, angle, (line, face) in zip(scene.fingers, nominal[-1, 3:], FINGERS, strict=True):
+    for finger, angle, (line, face) in zip(
+        scene.fingers, nominal[-1, 3:], style.FINGERS, strict=True
+    ):
         outline = 1e3 * trace_link(finger, float(angle))
         axes.add_patch(Polygon(outline, fc=face, ec=line, linewidth=0.9, zorder=1))
     copies = [record for record in study.records if "path" in record]
@@ -199,13 +186,15 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
         body = Polygon(1e3 * place_vertices(scene, path[-1]), fill=False, ec=colour)
         axes.add_patch(body).set(linewidth=0.5, alpha=0.35, zorder=2)
     for z, dash in ((nominal[0], (0, (4, 2))), (nominal[-1], "-")):
-        body = Polygon(1e3 * place_vertices(scene, z), fill=False, ec=INK, linestyle=dash)
+        body = Polygon(1e3 * place_vertices(scene, z), fill=False, ec=style.INK, linestyle=dash)
         axes.add_patch(body).set(linewidth=1.2, zorder=5)
-    axes.plot(*(1e3 * nominal[:, :2].T), color=INK, linewidth=1.6, zorder=4)
+    axes.plot(*(1e3 * nominal[:, :2].T), color=style.INK, linewidth=1.6, zorder=4)
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    deep = 1e3 * PALM * scene.scales.length
-    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=INK, linewidth=0, zorder=1))
+    deep = 1e3 * style.PALM * scene.scales.length
+    axes.add_patch(
+        Rectangle((left, -deep), right - left, deep, fc=style.INK, linewidth=0, zorder=1)
+    )
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
 
@@ -236,8 +225,8 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     ]
     axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
-    axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
-    axes.axhline(goal[1], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.axhline(goal[1], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
     beyond = len(study.records) - len(records)
     title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")

@@ -32,27 +32,8 @@ from ..results.adopt import Torques, narrow
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
+from . import style
 from .snapshots import draw_strip, lay_out_strip
-from .style import (
-    BAND,
-    FINGERS,
-    GRID,
-    INK,
-    LOST,
-    LOW,
-    STYLE,
-    WIDTH,
-    WIDTHS,
-    Styles,
-    choose_prefix,
-    choose_styles,
-    inset,
-    list_contacts,
-    open_figure,
-    unit_of,
-    write,
-    write_title,
-)
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -63,7 +44,11 @@ SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, 
 
 
 def draw_margins(
-    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, covered: Array | None = None
+    axes: Axes,
+    trajectory: Trajectory,
+    epsilon: float,
+    styles: style.Styles,
+    covered: Array | None = None,
 ) -> list[Line2D]:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
@@ -100,13 +85,13 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     low, high = (float(end) for end in transform.inverted().transform(ends + pad))
     axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
     axes.set_ylim(low, high)
-    prefix, factor = choose_prefix(reach)
+    prefix, factor = style.choose_prefix(reach)
     unit, bound = f"[{prefix}N]", f"linear to {factor * linear:g}"
     axes.set_ylabel(f"force margin $c_n - \\varepsilon$ {unit}, {bound}")
-    axes.axhspan(-epsilon, 0.0, color=LOW, linewidth=0, zorder=1.5)
-    axes.axhspan(low, -epsilon, color=LOST, linewidth=0, zorder=1.5)
+    axes.axhspan(-epsilon, 0.0, color=style.LOW, linewidth=0, zorder=1.5)
+    axes.axhspan(low, -epsilon, color=style.LOST, linewidth=0, zorder=1.5)
     look: Any = {"xycoords": "axes fraction", "ha": "left", "fontsize": 8, "color": "#7a2a12"}
-    write(axes, "contact lost, $c_n < 0$", (0, 0), (4, 3), **look)
+    style.write(axes, "contact lost, $c_n < 0$", (0, 0), (4, 3), **look)
     decades = linear * 10.0 ** np.arange(math.ceil(math.log10(reach / linear)) + 1)
     points = 72 / axes.figure.dpi * axes.bbox.height / np.ptp(ends)
     for digits in ([1, 2, 5], [1]):
@@ -118,7 +103,7 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
             break
     axes.yaxis.set_major_locator(FixedLocator(every.tolist()))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.grid(axis="y", color=GRID, linewidth=0.4)
+    axes.grid(axis="y", color=style.GRID, linewidth=0.4)
     _scale_ticks(axes, factor)
 
 
@@ -135,7 +120,7 @@ def draw_cones(
     axes: Axes,
     trajectory: Trajectory,
     scene: Scene,
-    styles: Styles,
+    styles: style.Styles,
     simulation: Simulation | None = None,
 ) -> list[Line2D]:
     """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
@@ -154,8 +139,8 @@ def draw_cones(
         lines += axes.plot(t, values, linewidth=1.8, label=name, **look)
     for edge in (-1.0, 1.0):
         axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
-        axes.axhspan(edge, 1.25 * edge, color=LOST, linewidth=0, zorder=1.5)
-    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+        axes.axhspan(edge, 1.25 * edge, color=style.LOST, linewidth=0, zorder=1.5)
+    axes.axhline(0.0, color=style.GRID, linewidth=0.5, zorder=1.6)
     axes.set(ylim=(-1.25, 1.25), yticks=[-1, 0, 1], ylabel="rolling\n$c_t / (\\mu c_n)$")
     if simulation is not None:
         first = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
@@ -178,17 +163,17 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
     tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
     t, tau = (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
     lines = []
-    for index, (colour, _) in enumerate(FINGERS):
+    for index, (colour, _) in enumerate(style.FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
         lines += axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)
-    for index, (colour, _) in enumerate(FINGERS):
+    for index, (colour, _) in enumerate(style.FINGERS):
         # Dashes that alternate keep both limits visible where they are equal.
         look = {"color": colour, "linewidth": 1.0, "linestyle": (6 * index, (5, 7)), "zorder": 2}
         axes.axhline(limits[index], label=None if index else "limits", **look)
         axes.axhline(-limits[index], **look)
-    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+    axes.axhline(0.0, color=style.GRID, linewidth=0.5, zorder=1.6)
     reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
-    prefix, factor = choose_prefix(reach)
+    prefix, factor = style.choose_prefix(reach)
     axes.set(ylim=(-reach, reach), ylabel=f"joint torque $\\tau$ [{prefix}N m]")
     _scale_ticks(axes, factor)
     return lines
@@ -199,18 +184,18 @@ def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
     t = trajectory.t
     pose = np.column_stack([1e3 * trajectory.q[:, :2], np.degrees(trajectory.q[:, 2])])
     looks: Any = (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))))
-    for column, (name, colour, line) in enumerate((*looks, ("phi [deg]", INK, "-."))):
+    for column, (name, colour, line) in enumerate((*looks, ("phi [deg]", style.INK, "-."))):
         panels[0].plot(t, pose[:, column], color=colour, linestyle=line, label=name)
     panels[0].set_ylabel("pose")
     panels[1].set_ylabel("joint angle\n[deg]")
     panels[2].set_ylabel("joint speed\n[rad/s]")
-    for index, (colour, _) in enumerate(FINGERS):
+    for index, (colour, _) in enumerate(style.FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
         look["label"] = f"finger {index + 1}"
         panels[1].plot(t, np.degrees(trajectory.theta[:, index]), **look)
         panels[2].plot(t, trajectory.theta_dot[:, index], **look)
     for axes in panels:
-        axes.grid(axis="y", color=GRID, linewidth=0.4)
+        axes.grid(axis="y", color=style.GRID, linewidth=0.4)
 
 
 def draw_simulation(
@@ -244,7 +229,7 @@ def draw_phases(
     points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
     taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
     for index, (start, end) in enumerate(pairwise(starts)):
-        colour = "white" if index % 2 else BAND
+        colour = "white" if index % 2 else style.BAND
         artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))
         middle, text = points * (start + end) / 2, f"phase {index + 1}"
         if 6.5 * len(text) >= points * (end - start):
@@ -255,7 +240,7 @@ def draw_phases(
             continue
         taken[row] = middle + half
         place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
-        artists.append(write(axes, text, place, (0, 4 + 10 * row), xycoords=units))
+        artists.append(style.write(axes, text, place, (0, 4 + 10 * row), xycoords=units))
     return artists
 
 
@@ -272,7 +257,7 @@ def force_margins(
     what: Torques,
     *,
     simulation: Simulation | None = None,
-    width: float = WIDTH,
+    width: float = style.WIDTH,
     motion: bool = False,
 ) -> Figure:
     """Draw a motion: snapshots, the force margin of every contact, and the torques.
@@ -298,11 +283,11 @@ def force_margins(
     _, trajectory = narrow(what)
     if trajectory is None:
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
-    width = WIDTHS.read(width, "width")
+    width = style.WIDTHS.read(width, "width")
     meta = trajectory.meta
     problem = read_own_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
-    scene, styles = problem.scene, choose_styles(trajectory.contacts)
+    scene, styles = problem.scene, style.choose_styles(trajectory.contacts)
     parts = [textwrap.shorten(str(meta.get("name", "")), 36, placeholder="\u2026")]
     objective = meta.get("objective")
     parts.append(f"objective {objective}" if objective else str(meta.get("status", "")))
@@ -324,15 +309,15 @@ def force_margins(
     title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / size_of_title)))
     left, gap = 0.8, 0.22
     top = foot + sum(sizes) + gap * (len(sizes) - 1) + 0.3 + strip.height
-    with open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:
+    with style.open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:
         draw_strip(figure, top, strip, trajectory, scene, styles)
         wide, low, places = width - left - (0.12 if slim else 1.3), foot, []
         for size in sizes:
             places.append((left, low, wide, size))
             low += size + gap
-        margins = inset(figure, *places[-1])
+        margins = style.inset(figure, *places[-1])
         torques, *others = (
-            inset(figure, *place, sharex=margins)
+            style.inset(figure, *place, sharex=margins)
             for place in [places[3 * motion], *places[-2:][:rolls], *places[2::-1][: 3 * motion]]
         )
         panels = [margins, torques, *others]
@@ -351,11 +336,11 @@ def force_margins(
             if axes is not lowest:
                 axes.tick_params(labelbottom=False)
             if not slim:
-                list_contacts(axes, 72 * axes.get_position().height * figure.get_figheight())
+                style.list_contacts(axes, 72 * axes.get_position().height * figure.get_figheight())
         if slim:
             legend: dict[str, Any] = {}
             for axes, name in ((margins, "margin"), (torques, "torque")):
-                axes.set_ylabel(f"{name} {unit_of(axes)}")
+                axes.set_ylabel(f"{name} {style.unit_of(axes)}")
                 lines, labels = axes.get_legend_handles_labels()
                 legend |= zip(labels, lines, strict=True)
             look: Any = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
@@ -363,7 +348,7 @@ def force_margins(
             figure.legend([*legend.values()], [*legend], **look)
         lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
         figure.align_ylabels(panels)
-        write_title(figure, "\n".join(title), size_of_title)
+        style.write_title(figure, "\n".join(title), size_of_title)
     return figure
 
 
@@ -379,5 +364,5 @@ def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180)
     # What a device or a pipe gets is a PNG.
     kind = ending if ending in _FORMATS else ".png"
     options: Any = {"format": kind[1:], "metadata": _FORMATS[kind], "dpi": resolution}
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(style.STYLE):
         write_whole(path, lambda stream: figure.savefig(stream, **options))

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -21,33 +22,8 @@ from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
+from ..figures import snapshots, style
 from ..figures.plots import draw_margins, draw_phases, draw_torques
-from ..figures.snapshots import (
-    NUMBER,
-    choose_numbers,
-    draw_bodies,
-    draw_joints,
-    draw_palm,
-    measure_box,
-    measure_scale,
-    turn,
-)
-from ..figures.style import (
-    BAND,
-    BODY,
-    FINGERS,
-    GRID,
-    INK,
-    LOST,
-    LOW,
-    PALETTE,
-    add_line,
-    choose_styles,
-    count_decimals,
-    list_contacts,
-    open_figure,
-    unit_of,
-)
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from .page import place_pushes
@@ -66,9 +42,9 @@ class _Scene:
         scene = self._scene = problem.scene
         self._axes, self._trajectory, self._ghost = axes, trajectory, ghost
         points, normals, forces = place_pushes(scene, trajectory)
-        low, high = measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
+        low, high = snapshots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
         self._size = float((high - low).max())
-        styles = choose_styles(trajectory.contacts)
+        styles = style.choose_styles(trajectory.contacts)
         self._colours = [styles[name].colour for name in trajectory.contacts]
         fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
         friction = np.array([scene.friction.of(finger) for finger in fingers])
@@ -88,9 +64,9 @@ class _Scene:
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_aspect("equal")
         axes.set_axis_off()
-        draw_palm(axes, scene, low[0], high[0])
-        scale, vertices = measure_scale(axes), scene.polygon.vertices
-        shifts = choose_numbers(scale * vertices)
+        snapshots.draw_palm(axes, scene, low[0], high[0])
+        scale, vertices = snapshots.measure_scale(axes), scene.polygon.vertices
+        shifts = snapshots.choose_numbers(scale * vertices)
         self._numbers = {k: vertices[k] + shift / scale for k, shift in shifts.items()}
 
     def draw(self, t: float) -> list[Artist]:
@@ -102,10 +78,11 @@ class _Scene:
         )
         if self._ghost is not None:
             behind = _blend(self._ghost.t, self._ghost.z, t)
-            artists += draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
-        artists += draw_bodies(axes, self._scene, z)
-        places = turn(z, np.array([*self._numbers.values()]).reshape(-1, 2))
-        look: Any = {"ha": "center", "va": "center", "fontsize": NUMBER, "color": "#555555"}
+            artists += snapshots.draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
+        artists += snapshots.draw_bodies(axes, self._scene, z)
+        places = snapshots.turn(z, np.array([*self._numbers.values()]).reshape(-1, 2))
+        look: Any = {"ha": "center", "va": "center", "color": "#555555"}
+        look["fontsize"] = snapshots.NUMBER
         for k, (x, y) in zip(self._numbers, places.tolist(), strict=True):
             artists.append(axes.text(x, y, str(k), **look))
         pressing = np.flatnonzero(self._presses[row]).tolist()
@@ -114,16 +91,16 @@ class _Scene:
             artists.append(axes.add_artist(cone))
         for k in pressing:
             arrow = _trace_arrow(self._points[row, k], self._arrows[row, k], 0.018 * self._size)
-            artists.append(add_line(axes, arrow, color=self._colours[k], lw=1.8))
+            artists.append(style.add_line(axes, arrow, color=self._colours[k], lw=1.8))
         for k in pressing:
             dot: Any = {"marker": "o", "ms": 5.5, "mfc": self._colours[k], "mec": "white"}
-            artists.append(add_line(axes, self._points[row, [k]], **dot))
+            artists.append(style.add_line(axes, self._points[row, [k]], **dot))
         for finger, torque in zip(self._scene.fingers, motion.tau[row].tolist(), strict=True):
             # At the limit an arc of three quarters.
             swept = 1.5 * math.pi * torque / finger.torque_limit
             arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * self._size)
-            artists.append(add_line(axes, arc, color=TURNS, lw=1.6))
-        return artists + draw_joints(axes, self._scene)
+            artists.append(style.add_line(axes, arc, color=TURNS, lw=1.6))
+        return artists + snapshots.draw_joints(axes, self._scene)
 
 
 def _blend(times: Array, values: Array, t: float) -> Array:
@@ -185,23 +162,24 @@ class Movie:
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
         problem, motion = self._problem, self._trajectory
-        with open_figure(8.0, 7.4, dpi=self._resolution) as figure:
+        with style.open_figure(8.0, 7.4, dpi=self._resolution) as figure:
             canvas: Any = figure.canvas
             scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, motion, self._ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
-            draw_margins(margins, motion, problem.epsilon, choose_styles(motion.contacts))
+            draw_margins(margins, motion, problem.epsilon, style.choose_styles(motion.contacts))
             draw_torques(torques, motion.torque, problem.scene.torque_limit)
             for axes, room in ((margins, 0.235), (torques, 0.14)):
                 draw_phases(axes, motion.phase_starts, labels=axes is margins)
-                list_contacts(axes, 72 * 7.4 * room, 8.0)
-            margins.set_ylabel(f"margin {unit_of(margins)}")
+                style.list_contacts(axes, 72 * 7.4 * room, 8.0)
+            margins.set_ylabel(f"margin {style.unit_of(margins)}")
             margins.tick_params(labelbottom=False)
-            label = rf"$\tau$ {unit_of(torques)}"
+            label = rf"$\tau$ {style.unit_of(torques)}"
             torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, motion.duration))
             figure.align_ylabels([margins, torques])
             canvas.draw()
-            still, decimals = canvas.copy_from_bbox(figure.bbox), count_decimals(motion.duration)
+            still = canvas.copy_from_bbox(figure.bbox)
+            decimals = style.count_decimals(motion.duration)
             look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
             for t in self.times:
                 canvas.restore_region(still)
@@ -209,7 +187,7 @@ class Movie:
                 for axes in (margins, torques):
                     cursor: Any = {"color": TURNS, "lw": 1.3}
                     cursor["transform"] = axes.get_xaxis_transform()
-                    moving.append(add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
+                    moving.append(style.add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
                 text = f"{problem.name}   t = {t:.{decimals}f} s"
                 moving.append(figure.text(0.02, 0.975, text, **look))
                 for artist in moving:
@@ -252,8 +230,8 @@ def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
 
     The rest are the colours of four pictures, mostly tints of these.
     """
-    colours = [*PALETTE, BAND, LOW, LOST, INK, GRID, "#ffffff", BODY, TURNS, GHOST]
-    colours += [colour for pair in FINGERS for colour in pair]
+    colours = [*style.PALETTE, style.BAND, style.LOW, style.LOST, style.INK, style.GRID]
+    colours += ["#ffffff", style.BODY, TURNS, GHOST, *chain(*style.FINGERS)]
     exact = np.array([ImageColor.getrgb(colour) for colour in colours])
     some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
     strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
