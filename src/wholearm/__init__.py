@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     )
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
+    from .design.figures import draw_sweep
     from .design.hand import Design, design_hand
     from .design.sensitivities import Sensitivities, find_sensitivities
     from .design.sweep import Sweep, sweep
-    from .design.sweep_figure import draw_sweep
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
     from .engines.mujoco import write_mjcf
     from .figures import plots
@@ -72,7 +72,7 @@ _NAMES = {
     "design.hand": "Design design_hand",
     "design.sensitivities": "Sensitivities find_sensitivities",
     "design.sweep": "Sweep sweep",
-    "design.sweep_figure": "draw_sweep",
+    "design.figures": "draw_sweep",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
     "engines.mujoco": "write_mjcf",
     "figures.map_figure": "draw_map",

@@ -182,17 +182,10 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
 def _survive(
     path: PathSamples, name: str, evaluate: Evaluate, way: float, epsilon: float, unit: float
 ) -> Survival:
-    thin = find_break(evaluate, epsilon, unit)
-    lost = find_break(evaluate, 0.0, unit, thin.speed if math.isfinite(thin.speed) else 0.0)
-    speed = None if math.isinf(thin.speed) else thin.speed
-    return Survival(
-        motion=name,
-        speed=speed,
-        duration=way / speed if speed else None,
-        lost=None if math.isinf(lost.speed) else lost.speed,
-        again=thin.again if thin.speed == 0 and math.isfinite(thin.again) else None,
-        first=_name(path, thin.least),
-    )
+    speed, again, least = find_break(evaluate, epsilon, unit)
+    lost, *_ = find_break(evaluate, 0.0, unit, speed or 0.0)
+    duration = way / speed if speed else None
+    return Survival(name, speed, duration, lost, again, _name(path, least))
 
 
 def _name(path: PathSamples, least: Least) -> Weakest:
@@ -243,15 +236,6 @@ class Least(NamedTuple):
 
 Evaluate = Callable[[float], Least]
 """What presses least at a speed [m/s]."""
-
-
-class Break(NamedTuple):
-    """The speed up to which contacts press with some force [N]."""
-
-    speed: float  # [m/s]: zero where they do not at any speed near rest; infinite if they do at any
-    least: Least  # what is there at a speed just above, or at that of zero
-    # [m/s]: where it is zero, the speed from which on they press; infinite if there is none
-    again: float
 
 
 class UnitProfile(NamedTuple):
@@ -311,14 +295,22 @@ def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     return evaluate
 
 
-def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.0) -> Break:
-    """The least speed at which less than a `wanted` force [N] is left.
+def find_break(
+    evaluate: Evaluate, wanted: float, unit: float, above: float = 0.0
+) -> tuple[float | None, float | None, Least]:
+    """The least speed at which less than a `wanted` force [N] is left, by bisection.
 
     Parameters
     ----------
     wanted : [N]
     unit : [m/s]   the scene's speed
     above : [m/s]  speed up to which more than that is known to be left, if it is at rest
+
+    Returns
+    -------
+    speed : [m/s]  zero where less is left near rest, None where no speed leaves less
+    again : [m/s]  where that is zero, the speed from which on enough is left; None if there is none
+    least          what presses least just above the speed
     """
     start, low = evaluate(0.0), above
     holds = start.force >= wanted
@@ -329,7 +321,7 @@ def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.
             break
         low = high
     else:
-        return Break(np.inf, start, 0.0) if holds else Break(0.0, start, np.inf)
+        return (None if holds else 0.0), None, start
     for _ in range(24):
         middle = (low + high) / 2
         sample = evaluate(middle)
@@ -337,7 +329,7 @@ def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.
             low = middle
         else:
             high, least = middle, sample
-    return Break(high, least, 0.0) if holds else Break(0.0, start, high)
+    return (high, None, least) if holds else (0.0, high, start)
 
 
 @dataclass(frozen=True, eq=False)

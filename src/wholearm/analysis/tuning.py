@@ -137,25 +137,21 @@ class Bench:
     trials
     simulations       trials, and landings
     way : [m or rad]  how far away the end is
+    is_angle          whether the end of the passage is one of phi
     """
 
     def __init__(self, problem: Problem, passage: Passage, z: Array) -> None:
         self.problem, self.passage, self.z = problem, passage, z
         self.system = build_system(problem.scene)
-        until = passage.until
-        self.until = "" if until.contact is None else until.contact.name
-        self.pair = self.system.names.index(self.until) if self.until else None
+        until, names = passage.until, self.system.names
+        self.pair = None if until.contact is None else names.index(until.contact.name)
         self.column = 0 if until.coordinate == "x" else 2
         self.value = math.nan if until.value is None else until.value
         self.sign = float(np.sign(z[self.column] - self.value))
         self.way = float(self.measure(z[None])[0])
+        self.is_angle = self.pair is None and self.column == 2
         self.trials: list[TuningTrial] = []
         self.simulations = 0
-
-    @property
-    def is_angle(self) -> bool:
-        """Whether the end of the passage is one of phi."""
-        return self.pair is None and self.column == 2
 
     def measure(self, z: Array) -> Array:
         """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
@@ -740,16 +736,13 @@ class TuningRule:
         scales = bench.problem.scene.scales
         self.slow = SETTINGS.slow * scales.speed / (scales.length if bench.is_angle else 1.0)
         self.time = scales.time
+        # Two freedoms where the object arrives.
+        self.is_free = bench.passage.phases[-1].formation.n_constraints < 4
 
     @property
     def is_exhausted(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
         return self.bench.simulations > SETTINGS.simulations
-
-    @property
-    def is_free(self) -> bool:
-        """Whether the object has two freedoms where it arrives."""
-        return self.bench.passage.phases[-1].formation.n_constraints < 4
 
     def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
         """The torques raised so many times, lowered where negative."""

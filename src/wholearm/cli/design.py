@@ -79,7 +79,7 @@ def sweep(options: argparse.Namespace) -> int:
     require_output(output, ".csv")
     require_output(options.figure)
     if options.figure is not None:
-        from ..design.sweep_figure import choose_axes
+        from ..design.figures import choose_axes
 
         choose_axes(vary, options.samples, len(options.problems))
     start = partial(Processes, options.jobs)
@@ -98,7 +98,7 @@ def sweep(options: argparse.Namespace) -> int:
     )
     write_text(output, result.to_csv())
     if options.figure is not None:
-        from ..design.sweep_figure import draw_sweep
+        from ..design.figures import draw_sweep
         from ..figures.plots import save
 
         save(draw_sweep(result), options.figure)

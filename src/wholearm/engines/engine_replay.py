@@ -332,6 +332,8 @@ def _list_changes(
 ) -> Iterator[tuple[float, float, str]]:
     """Deviations of contacts from the plan in a phase: their intervals [s], and in words."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
+    flags = list[tuple[str, NDArray[np.bool_], Array]]()
+    t, moves = run.t[rows], 2e-3 * scales.speed
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
     planned = formation.evaluate(part.want.z, part.want.z_dot)
     slides = np.einsum("nij,nj->ni", actual.A_t, run.z_dot[rows])
@@ -339,24 +341,19 @@ def _list_changes(
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
         pressing[:, run.find_columns(name, problem.scene)] = 0.0
-        yield from _find_runs(run.t[rows], actual.C[:, k] > 0.1 * reach, f"{name} opens")
-        moves = 2e-3 * scales.speed
+        flags.append((f"{name} opens", actual.C[:, k] > 0.1 * reach, t))
+        slide, planned_slide = np.abs(slides[:, k]), np.abs(meant[:, k])
         if k in formation.rolling_rows:
-            yield from _find_runs(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
-            continue
-        held = (np.abs(meant[:, k]) > moves) & (np.abs(slides[:, k]) < SLOW * np.abs(meant[:, k]))
-        yield from _find_runs(run.t[rows], held, f"{name} sticks")
-    for column in np.flatnonzero((pressing > PRESS * scales.force).any(axis=0)):
-        hits = pressing[:, column] > PRESS * scales.force
-        times = run.t[rows[rows > 0]]
-        yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
-
-
-def _find_runs(
-    t: Array, happens: NDArray[np.bool_], what: str
-) -> Iterator[tuple[float, float, str]]:
-    """Intervals in which a flag is set."""
-    return ((float(t[run.start]), float(t[run.stop - 1]), what) for run in find_runs(happens))
+            flags.append((f"{name} slips", slide > moves, t))
+        else:
+            held = (planned_slide > moves) & (slide < SLOW * planned_slide)
+            flags.append((f"{name} sticks", held, t))
+    for name, force in zip(run.pairs, pressing.T, strict=True):
+        hits = force > PRESS * scales.force
+        flags.append((f"{name} presses, which is not planned,", hits, run.t[rows[rows > 0]]))
+    for what, happens, times in flags:
+        for span in find_runs(happens):
+            yield float(times[span.start]), float(times[span.stop - 1]), what
 
 
 class StretchEnd(NamedTuple):

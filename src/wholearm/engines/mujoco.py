@@ -7,7 +7,7 @@ position and as the keyframe ``home``. What else a plan adds is described in `ad
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -45,19 +45,12 @@ CLOCK = "clock"
 HIDDEN = {"group": 3}
 """Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
 STEP = 1.6e-4  # Time step, over the scene's time: 1e-5 s in the scenes of `problems/`
-
-
-class Softness(NamedTuple):
-    """Softness of contacts.
-
-    In a convex contact model sliding separates the surfaces at a rate that falls with the time
-    constant of friction and with the impedance.
-    """
-
-    press: float = 7.5  # time constant of the gap (critically damped), in time steps
-    rub: float = 300.0  # time constant of the sliding speed, in time steps
-    impedance: float = 0.01  # share of the unconstrained motion that a contact takes away
-    ratio: float = 100.0  # impedance of friction over that of the gap
+# In a convex contact model sliding separates the surfaces at a rate that falls with the time
+# constant of friction and with the impedance.
+PRESS = 7.5  # time constant of the gap (critically damped), in time steps
+RUB = 300.0  # time constant of the sliding speed, in time steps
+IMPEDANCE = 0.01  # share of the unconstrained motion that a contact takes away
+RATIO = 100.0  # impedance of friction over that of the gap
 
 
 def write_mjcf(
@@ -65,7 +58,7 @@ def write_mjcf(
     plan: Trajectory | Moved | None = None,
     *,
     step: float | None = None,
-    softness: Softness | None = None,
+    softness: float = 1.0,
 ) -> str:
     """The scene as the text of an MJCF file.
 
@@ -74,6 +67,7 @@ def write_mjcf(
     plan        its torques are part of the model, and each of its phases has a keyframe at its
                 start
     step : [s]  `STEP` of the scene's time when left out
+    softness    factor of the time constants of contacts
 
     Raises
     ------
@@ -85,15 +79,14 @@ def write_mjcf(
         home = plan.z[0]
     root = Element("mujoco", model=problem.name)
     step = STEP * scene.scales.time if step is None else step
-    softness = Softness() if softness is None else softness
-    _add_options(root, scene, step, softness)
+    _add_options(root, scene, step)
     world = add(root, "worldbody")
     reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
     place, size = [0.0, -find_rounding(scene), 0.0], [reach, reach, reach / 100]
     _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
     _add_object(world, scene, home[:3])
     _add_links(world, scene, home[3:])
-    contact, impedance = add(root, "contact"), softness.impedance
+    contact = add(root, "contact")
     for pair in list_pairs(scene):
         rough = pair.friction > 0
         add(
@@ -104,9 +97,9 @@ def write_mjcf(
             geom2=pair.second,
             condim="3" if rough else "1",
             friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
-            solref=[softness.press * step, 1.0],
-            solreffriction=[softness.rub * step, 1.0],
-            solimp=[impedance, impedance, 1.0],
+            solref=[softness * PRESS * step, 1.0],
+            solreffriction=[softness * RUB * step, 1.0],
+            solimp=[IMPEDANCE, IMPEDANCE, 1.0],
         )
     motors = add(root, "actuator")
     for number, link in enumerate(scene.fingers, 1):
@@ -122,14 +115,14 @@ def write_mjcf(
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _add_options(root: Element, scene: Scene, step: float, softness: Softness) -> None:
+def _add_options(root: Element, scene: Scene, step: float) -> None:
     """Units and solver, and how a viewer shows the scene."""
     size, depth = scene.polygon.size, scene.polygon.size / 20
     add(root, "compiler", angle="radian", autolimits="true")
     # MuJoCo 4.0.0 factorises sparse Hessians wrongly; its midphase drops shapes this thin.
     solver_options = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
     gravity = [0.0, -scene.gravity, 0.0]
-    tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": softness.ratio}
+    tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": RATIO}
     option = add(root, "option", timestep=step, gravity=gravity, **tight, **solver_options)
     add(option, "flag", midphase="disable")
     add(root, "statistic", center=[0.0, size / 2, 0.0], extent=2 * size)
@@ -244,9 +237,7 @@ def play(
 
     steps = list_steps(problem, stretch, torque, setting.step)
     drive = EngineDrive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
-    softness, factor = Softness(), setting.softness
-    softness = softness._replace(press=factor * softness.press, rub=factor * softness.rub)
-    text = write_mjcf(problem, step=steps.h, softness=softness)
+    text = write_mjcf(problem, step=steps.h, softness=setting.softness)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     pairs = list_pairs(problem.scene)

@@ -142,11 +142,9 @@ def _name_failure(own: Survival) -> str:
     """What gives way first in one motion, and at which speed."""
     if own.speed is None:
         return "keeps \u03b5 at any speed"
-    if own.speed > 0:
-        return f"{own.speed:.3g} m/s: {own.first.name}"
-    if own.again is not None:
-        return f"only from {own.again:.3g} m/s on: {own.first.name}"
-    return f"never: {own.first.name}"
+    again = "never" if own.again is None else f"only from {own.again:.3g} m/s on"
+    speed = f"{own.speed:.3g} m/s" if own.speed else again
+    return f"{speed}: {own.first.name}"
 
 
 @exclusive
