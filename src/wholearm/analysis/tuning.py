@@ -131,6 +131,7 @@ class Bench:
     Parameters
     ----------
     z : (5,)  where it starts, at rest
+    tell      shown each trial, in words
 
     Attributes
     ----------
@@ -140,8 +141,10 @@ class Bench:
     is_angle          whether the end of the passage is one of phi
     """
 
-    def __init__(self, problem: Problem, passage: Passage, z: Array) -> None:
-        self.problem, self.passage, self.z = problem, passage, z
+    def __init__(
+        self, problem: Problem, passage: Passage, z: Array, tell: Callable[[str], None]
+    ) -> None:
+        self.problem, self.passage, self.z, self.tell = problem, passage, z, tell
         self.system = build_system(problem.scene)
         until, names = passage.until, self.system.names
         self.pair = None if until.contact is None else names.index(until.contact.name)
@@ -159,13 +162,14 @@ class Bench:
             return self.sign * (z[:, self.column] - self.value)
         return np.asarray(self.system.measure(z)[0][:, self.pair])
 
-    def run(self, steps: Sequence[TuningStep]) -> TuningTrial:
+    def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
         torque = read_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
         self.trials.append(self._judge(tuple(steps), simulation))
+        self.tell(f"{title}: {self.trials[-1].to_text()}")
         return self.trials[-1]
 
     def land(self, steps: Sequence[TuningStep], arrival: float, end: float) -> tuple[Array, str]:
@@ -290,11 +294,6 @@ class Passage:
         """What ends it."""
         return self.phases[-1].until
 
-    @property
-    def title(self) -> str:
-        """The numbers of its phases, for people."""
-        return name_numbers(self.phases[0].number, self.phases[-1].number)
-
     def list_pressed(self, index: int) -> list[str]:
         """The contacts of a phase that press to its end: without those that it releases."""
         phase, after = self.phases[index], (*self.phases[1:], self.after)[index]
@@ -302,16 +301,24 @@ class Passage:
         return [name for name in phase.formation.names if name not in leaving]
 
     def follow(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
-        """When its phases end [s], as far as they do, and the first loss of a contact before."""
+        """When its phases end [s], as far as they do, and the first loss of a contact before.
+
+        Events end a phase that gains or releases a contact; a coordinate that ends one is no event.
+        """
         ends: list[float] = []
-        following = (*self.phases[1:], self.after)
+        gains = EventKind.GAINED, EventKind.IMPACT, EventKind.PASS
         for event in events:
-            phase, after = self.phases[len(ends)], following[len(ends)]
-            if _is_end(phase, after, event):
+            phase, after = self.phases[len(ends)], (*self.phases[1:], self.after)[len(ends)]
+            until, lost = phase.until, event.kind is EventKind.CONTACT_LOST
+            if until.contact is not None:
+                is_end = event.kind in gains and event.contact == until.contact.name
+            else:
+                is_end = until.is_release and lost and event.contact in list_leaving(phase, after)
+            if is_end:
                 ends.append(event.time)
                 if len(ends) == len(self.phases):
                     break
-            elif event.kind is EventKind.CONTACT_LOST and event.contact in phase.formation.names:
+            elif lost and event.contact in phase.formation.names:
                 return ends, event
         return ends, None
 
@@ -330,21 +337,6 @@ def split_passages(problem: Problem) -> list[Passage]:
             passages.append(Passage(tuple(phases), after))
             phases = []
     return passages
-
-
-def name_numbers(first: int, last: int) -> str:
-    """Numbers of phases, such as 3 or 9-11."""
-    return f"{first}" if first == last else f"{first}-{last}"
-
-
-def _is_end(phase: Phase, after: Phase | None, event: Event) -> bool:
-    """Whether an event ends a phase; a coordinate that does is none."""
-    until = phase.until
-    if until.contact is not None:
-        gains = EventKind.GAINED, EventKind.IMPACT, EventKind.PASS
-        return event.kind in gains and event.contact == until.contact.name
-    gone = event.kind is EventKind.CONTACT_LOST
-    return until.is_release and gone and event.contact in list_leaving(phase, after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,8 +366,8 @@ class PhaseTuning:
 
     @property
     def title(self) -> str:
-        """Its numbers, for people."""
-        return name_numbers(self.number, self.last)
+        """Its numbers, such as 3 or 9-11."""
+        return f"{self.number}" if self.number == self.last else f"{self.number}-{self.last}"
 
     @property
     def finger(self) -> str:
@@ -579,13 +571,12 @@ class _Setting(NamedTuple):
         if balance is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
             return tuning, None, text
-        bench, (balanced, acting) = Bench(self.problem, self.passage, z), balance
-        title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
-        best: _Attempt | None = None
-        tell: Callable[[str], None] = lambda text: self.tell(f"{title}: {text}")  # noqa: E731
+        best, (balanced, acting) = None, balance
+        title = f"phase {tuning.title} of {len(self.problem.phases)}, finger {acting + 1}"
+        bench = Bench(self.problem, self.passage, z, lambda text: self.tell(f"{title}: {text}"))
         # Supporting torques until one serves.
         for tau in list_starts(balanced, acting):
-            rule = TuningRule(bench, tau, balanced[-1], acting, tell)
+            rule = TuningRule(bench, tau, balanced[-1], acting)
             attempt = self._tune_from(rule, replace(tuning, acting=acting + 1))
             if attempt[1] is not None:
                 return attempt
@@ -724,14 +715,10 @@ class TuningRule:
     tau : (2,) [N m]   quasistatic torques that are raised and lowered
     last : (2,) [N m]  those at the end of the phase
     acting             index of the acting finger
-    tell               shown each trial, in words
     """
 
-    def __init__(
-        self, bench: Bench, tau: Array, last: Array, acting: int, tell: Callable[[str], None]
-    ) -> None:
-        self.bench, self.acting, self.tell = bench, acting, tell
-        self.tau, self.last = tau, last
+    def __init__(self, bench: Bench, tau: Array, last: Array, acting: int) -> None:
+        self.bench, self.tau, self.last, self.acting = bench, tau, last, acting
         self.limit = bench.problem.scene.torque_limit
         scales = bench.problem.scene.scales
         self.slow = SETTINGS.slow * scales.speed / (scales.length if bench.is_angle else 1.0)
@@ -761,7 +748,7 @@ class TuningRule:
             tau = self.scale(raised)
             if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
-            trial = self._run([TuningStep(0.0, tau)], f"raised {raised} times")
+            trial = self.bench.run([TuningStep(0.0, tau)], f"raised {raised} times")
             if trial.outcome is TrialOutcome.ARRIVES:
                 drives.append(TuningDrive(raised, trial))
             elif trial.outcome is TrialOutcome.LOSES:
@@ -841,7 +828,7 @@ class TuningRule:
             at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
         for count in range(SETTINGS.trials):
             steps = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self._run(steps, f"brake at {at:.5g} s")
+            trial = self.bench.run(steps, f"brake at {at:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
@@ -877,7 +864,7 @@ class TuningRule:
 
         def run(at: float) -> tuple[float, TuningTrial]:
             again = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self._run(again, f"brake at {at:.5g} s")
+            trial = self.bench.run(again, f"brake at {at:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
         grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
@@ -906,11 +893,6 @@ class TuningRule:
         """How far beyond the end the object would come to rest, less the wanted speed's part."""
         slowing = max(trial.slowing, 0.1 * trial.rate / self.time)
         return (trial.rate**2 - (0.5 * slow) ** 2) / (2 * slowing)
-
-    def _run(self, steps: list[TuningStep], text: str) -> TuningTrial:
-        trial = self.bench.run(steps)
-        self.tell(f"{text}: {trial.to_text()}")
-        return trial
 
 
 def list_starts(tau: Array, acting: int) -> list[Array]:

@@ -129,7 +129,7 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
     """The phases that a route prints, planned and carried out in the ways that are asked for."""
     row: Row = {"ways": {}}
     table = {key: entry for key, entry in problem.table.items() if key != "goal"}
-    objective, printed = answer.plan.options.goal, None
+    objective, printed = answer.plan.options.goal.value, None
     limit = RATE * min(finger.torque_limit for finger in problem.scene.fingers)
     changes: dict[str, dict[str, Any]] = {
         "time": {},

@@ -33,16 +33,8 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..search import solve
 from ..verification.verify import verify
+from . import page
 from .movie import Movie, write_movie
-from .page import (
-    build_page,
-    count_places,
-    describe_hand,
-    describe_motion,
-    fold,
-    write_chart,
-    write_player,
-)
 
 
 def build_report(
@@ -91,12 +83,12 @@ def build_report(
     machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
         "<h2>Contact formations</h2>",
-        write_chart(*describe_map(chart, first)),
+        page.write_chart(*describe_map(chart, first)),
         "<h2>Problem</h2>",
-        fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
+        page.fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
         Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
-    return build_page(problem.name, parts)
+    return page.build_page(problem.name, parts)
 
 
 def _write_svg(figure: Figure) -> str:
@@ -123,7 +115,7 @@ def _describe(contender: Contender, most: int) -> list[str]:
     shown = planned or replayed
     if shown is not None and problem is not None:
         ghost = replayed if planned is not None else None
-        parts.append(write_player(describe_motion(shown, problem, ghost, most)))
+        parts.append(page.write_player(page.describe_motion(shown, problem, ghost, most)))
         timings = shown.meta.get("timings")
         # Routes are planned from parts that are replayed before: then nothing is left of a step.
         steps = timings.items() if isinstance(timings, dict) else ()
@@ -132,7 +124,7 @@ def _describe(contender: Contender, most: int) -> list[str]:
         tables.append(Table(["planning took", "[s]:.4g"], took))
         parts.append(Document("", parts=tables).to_html())
     if report is not None:
-        parts.append(fold(report.document.to_html(), "what verify says"))
+        parts.append(page.fold(report.document.to_html(), "what verify says"))
     return parts
 
 
@@ -200,7 +192,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
     poses = close_fingers(scene, *middles.T).z
 
     def describe(contacts: Iterable[Contact], text: str, z: Array) -> dict[str, Any]:
-        names, values = [c.name for c in contacts], np.round(z, count_places(scene)).tolist()
+        names, values = [c.name for c in contacts], np.round(z, page.count_places(scene)).tolist()
         return {"contacts": names, "text": text, "z": values}
 
     places = []
@@ -217,7 +209,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
         places.append(describe(crossing.contacts, text, crossing.z[None]))
     low, high = ([1e3 * float(chart.x[k]), math.degrees(chart.phi[k])] for k in (0, -1))
     axes = {"low": low, "high": high, "box": [72 * v for v in BOX], "tall": 72 * SIZE[1]}
-    return drawing, {"id": PLACE, "hand": describe_hand(scene), "places": places, "axes": axes}
+    return drawing, {"id": PLACE, "hand": page.describe_hand(scene), "places": places, "axes": axes}
 
 
 def _describe_border(border: Border, times: Array) -> str:
