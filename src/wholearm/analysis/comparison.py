@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Any
@@ -52,6 +53,13 @@ class Contender:
     problem: Problem | None = field(default=None, repr=False)
     # the motion that was given; None for torques alone
     planned: Trajectory | None = field(default=None, repr=False)
+
+    @property
+    def replayed(self) -> Trajectory | None:
+        """The motion of the replay; None where it loses a contact at once, or could not go on."""
+        with suppress(SimulationError):
+            return None if self.report is None else self.report.trajectory
+        return None
 
     @property
     def verdict(self) -> str:

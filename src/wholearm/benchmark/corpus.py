@@ -697,12 +697,12 @@ def compare(family: str, found: Any, stored: Any) -> tuple[str, list[str]]:
     if stored is None:
         return "differs", ["no answer is stored; --update stores it"]
     if family == "counts":
-        texts = [f"{key} is counted in one of them alone" for key in found.keys() ^ stored.keys()]
+        grown = [f"{key} is counted in one of them alone" for key in found.keys() ^ stored.keys()]
         for key in found.keys() & stored.keys():
             if found[key] > (most := stored[key] * BANDS.get(key, 1.0)):
                 text = f"{key} has grown from {stored[key]} to {found[key]}"
-                texts.append(f"{text} (allowed: {most:.0f})" if key in BANDS else text)
-        return ("differs", sorted(texts)) if texts else ("same", [])
+                grown.append(f"{text} (allowed: {most:.0f})" if key in BANDS else text)
+        return ("differs", sorted(grown)) if grown else ("same", [])
     if "value" in found and found["objective"] == stored.get("objective"):
         gain = found["value"] / stored["value"] - 1
         gain = gain if stored["objective"] == "margin" else -gain

@@ -566,13 +566,8 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
             )
 
     path = toppra.SplineInterpolator(grid, grid[:, None])
-    planner = toppra.algorithm.TOPPRA(
-        [Limits()],
-        path,
-        gridpoints=grid,
-        solver_wrapper="seidel",
-        parametrizer="ParametrizeConstAccel",
-    )
+    options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
+    planner = toppra.algorithm.TOPPRA([Limits()], path, gridpoints=grid, **options)
 
     def run() -> PeerPlan:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)

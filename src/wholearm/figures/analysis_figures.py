@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,17 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from ..common.errors import SimulationError
 from ..common.sharing import exclusive
 from . import style
 from .plots import draw_margins, draw_phases
 from .snapshots import place_vertices, trace_link
 
 if TYPE_CHECKING:
-    from ..analysis.comparison import Comparison, Contender
+    from ..analysis.comparison import Comparison
     from ..analysis.robustness import Robustness
     from ..analysis.slow_speeds import PhasePrediction, Prediction, Survival
-    from ..results.trajectory import Trajectory
 
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
@@ -39,12 +36,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     Replays are drawn; where nothing has moved a panel says so.
     """
-    shown: list[tuple[Contender, Trajectory | None]] = []
-    for contender in comparison.contenders:
-        motion = None
-        with suppress(SimulationError):
-            motion = None if contender.report is None else contender.report.trajectory
-        shown.append((contender, motion))
+    shown = [(contender, contender.replayed) for contender in comparison.contenders]
     motions = [motion for _, motion in shown if motion is not None]
     styles = style.choose_styles(
         tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))

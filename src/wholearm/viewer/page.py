@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, find_runs
+from ..common.document import plain
 from ..common.sharing import exclusive
 from ..contacts.closing import Numbers
 from ..contacts.elemental import build_features, build_geometry, parse_contact
@@ -178,7 +179,4 @@ def count_places(scene: Scene) -> int:
 
 def _round(values: Array) -> Any:
     """Nested lists of numbers with six digits, None where there is no number."""
-    flat: list[Any] = [None if v != v else float(f"{v:.6g}") for v in values.ravel().tolist()]
-    for size in values.shape[:0:-1]:
-        flat = [flat[k : k + size] for k in range(0, len(flat), size)]
-    return flat
+    return plain(np.reshape([float(f"{v:.6g}") for v in values.ravel().tolist()], values.shape))

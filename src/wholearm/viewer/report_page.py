@@ -7,7 +7,6 @@ import math
 import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from html import escape
 from typing import Any
 
@@ -18,7 +17,6 @@ from matplotlib.figure import Figure
 from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
 from ..common.document import Document, Table, fixed, show
-from ..common.errors import SimulationError
 from ..common.files import make_folder, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
@@ -67,10 +65,7 @@ def build_report(
         progress(f"writing {contender.name}")
         # All motions together leave a page at some 3 MB.
         parts += _describe(contender, 8000 // len(comparison.contenders))
-    first = next(
-        (contender.planned for contender in comparison.contenders if contender.planned is not None),
-        None,
-    )
+    first = next(filter(None, (contender.planned for contender in comparison.contenders)), None)
     if sensitivities:
         from ..design.figures import draw_sensitivities
         from ..design.sensitivities import find_sensitivities
@@ -107,11 +102,7 @@ def _describe(contender: Contender, most: int) -> list[str]:
     problem, planned, report = contender.problem, contender.planned, contender.report
     parts = [f"<h2>{escape(contender.name)}</h2>"]
     parts.append(Document("", contender.verdict, contender.reason).to_html())
-    replayed = None
-    if report is not None:
-        # Torques that lose a contact at once leave no motion to show.
-        with suppress(SimulationError):
-            replayed = report.trajectory
+    replayed = contender.replayed
     shown = planned or replayed
     if shown is not None and problem is not None:
         ghost = replayed if planned is not None else None
