@@ -126,10 +126,13 @@ def list_cases() -> Iterator[Case]:
 
 
 def answer(case: Case, folder: Path) -> Row:
-    """What the package says to a case; `folder` has the shipped problems."""
+    """What the package says to a case, or why it refuses; `folder` has the shipped problems."""
     family, *arguments = case
-    row: Row = _shorten(FAMILIES[family](folder, *arguments))
-    return row
+    try:
+        row = FAMILIES[family](folder, *arguments)
+    except wholearm.WholearmError as error:
+        row = _refuse(error)
+    return dict(_shorten(row))
 
 
 def _shorten(value: Any) -> Any:
@@ -218,12 +221,9 @@ def _verify(problem: Problem, what: Any) -> Row:
 
 
 def _solve(problem: Problem, **options: Any) -> Row:
-    """A plan with its replay, or why there is none."""
-    try:
-        plan = wholearm.solve(problem, **options)
-        return _describe_plan(plan) | {"replay": _verify(problem, plan)}
-    except wholearm.WholearmError as error:
-        return _refuse(error)
+    """A plan with its replay."""
+    plan = wholearm.solve(problem, **options)
+    return _describe_plan(plan) | {"replay": _verify(problem, plan)}
 
 
 def _plan(folder: Path, name: str, objective: str, **options: Any) -> Row:
@@ -251,10 +251,7 @@ def _reach(folder: Path, number: int) -> Row:
         problem = problem.with_({"goal": free})
     # What is known of a scene from other goals may lead to another route.
     forget_roadmaps()
-    try:
-        answer = wholearm.find_route(problem)
-    except wholearm.WholearmError as error:
-        return _refuse(error)
+    answer = wholearm.find_route(problem)
     phases = [
         f"{' '.join(phase['contacts'])} {phase.get('end', '')}"
         for phase in answer.problem.table["phases"]
@@ -265,11 +262,7 @@ def _reach(folder: Path, number: int) -> Row:
 
 
 def _scene(folder: Path, number: int, objective: str) -> Row:
-    try:
-        problem = _read_table(draw_case(SEED, number).table)
-    except wholearm.WholearmError as error:
-        return _refuse(error)
-    return _solve(problem, objective=objective)
+    return _solve(_read_table(draw_case(SEED, number).table), objective=objective)
 
 
 def _read_table(table: Any) -> Problem:
@@ -300,10 +293,12 @@ def _simulate_free(folder: Path, name: str) -> Row:
         "failures": [mask(text) for text in report.failures],
         "phases": [phase.number for phase in report.alone if phase.reached],
         "stops": [phase.stop for phase in report.alone],
-        "lost": [
-            f"{phase.number} {loss.contact}" for phase in report.alone for loss in phase.losses
-        ],
+        "lost": [f"{number} {loss.contact}" for number, loss in _list_losses(report.alone)],
     }
+
+
+def _list_losses(phases: Iterable[Any]) -> list[tuple[int, Any]]:
+    return [(phase.number, loss) for phase in phases for loss in phase.losses]
 
 
 def _follow(folder: Path, name: str, share: float) -> Row:
@@ -312,7 +307,7 @@ def _follow(folder: Path, name: str, share: float) -> Row:
     torque = wholearm.read_torque_csv(str(folder / "torques" / TUNED[name][0]))
     torque = replace(torque, coefficients=share * torque.coefficients)
     report = wholearm.verify_free(problem, torque)
-    lost = [(phase.number, loss) for phase in report.phases for loss in phase.losses]
+    lost = _list_losses(report.phases)
     # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.
     end = min([report.phases[0].stop, *(loss.time for _, loss in lost)]) - 1e-3
     events = [event for event in report.whole.events if event.time < end]
@@ -362,11 +357,8 @@ def _control(folder: Path, name: str) -> Row:
     """The policy of a least-time plan, and what becomes of its phases."""
     problem = _load(folder, name)
     plan = wholearm.solve(problem)
-    try:
-        policy = wholearm.make_policy(problem, plan)
-        report = wholearm.verify_policy(problem, plan, policy)
-    except wholearm.WholearmError as error:
-        return _refuse(error)
+    policy = wholearm.make_policy(problem, plan)
+    report = wholearm.verify_policy(problem, plan, policy)
     return {
         "duration": policy.duration,
         "durations": [phase["duration"] for phase in policy.about["phases"]],
@@ -374,9 +366,7 @@ def _control(folder: Path, name: str) -> Row:
         "ok": report.ok,
         "reached": [phase.number for phase in report.phases if phase.reached],
         "stops": [phase.stop for phase in report.phases],
-        "lost": [
-            f"{phase.number} {loss.contact}" for phase in report.phases for loss in phase.losses
-        ],
+        "lost": [f"{number} {loss.contact}" for number, loss in _list_losses(report.phases)],
     }
 
 

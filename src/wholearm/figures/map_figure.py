@@ -70,9 +70,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
         drawing.draw_cells()
         drawing.draw_directions(drawing.draw_labels())
         drawing.draw_borders()
-        drawing.draw_crossings()
         drawing.draw_paths()
-        drawing.name_palm_lines()
         drawing.draw_legend()
         limits = " and ".join(dict.fromkeys(f"{v:g}" for v in problem.scene.torque_limit))
         title = f"{problem.name}  \u00b7  contact formations with palm and both fingers touching"
@@ -183,7 +181,10 @@ class _Drawing:
         add_line(self.axes, crosses, marker="x", ms=3.5, ls="none", color=_AMBIGUOUS, zorder=2)
 
     def draw_borders(self) -> None:
-        """Borders, with lines beside them to where motions are possible, and what can be hit."""
+        """Borders with lines beside them to where motions are possible, and crossings.
+
+        Beside the axes stands which edge lies on the palm.
+        """
         flush = [border for border in self.chart.borders if border.flush is not None]
         passing = [_to_axes(border.points) for border in self.chart.borders if border.flush is None]
         every = [_to_axes(border.points) for border in flush]
@@ -203,14 +204,17 @@ class _Drawing:
         self._add_lines(list(cut(every, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
         for points in every:
             add_line(self.axes, points, lw=9, alpha=0.0, zorder=5.5, gid=next(self.gids))
-
-    def draw_crossings(self) -> None:
-        """Dots; those where only a contact changes its name on a border are small."""
+        dot: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "ls": "none"}
         for crossing in self.chart.crossings:
-            look: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "zorder": 6}
-            look |= {"ls": "none", "gid": next(self.gids)}
-            look["ms"] = 3.6 if len(crossing.flush) >= 2 else 2.4
-            add_line(self.axes, _to_axes(crossing.point[None]), **look)
+            # Where only a contact changes its name on a border the dot is small.
+            size = 3.6 if len(crossing.flush) >= 2 else 2.4
+            point, gid = _to_axes(crossing.point[None]), next(self.gids)
+            add_line(self.axes, point, ms=size, zorder=6, gid=gid, **dot)
+        look: Any = {"ha": "left", "va": "center", "fontsize": 7.6}
+        edges = {b.points[0, 1]: b.contacts[0].index for b in self.chart.borders if b.along == "x"}
+        for angle, edge in edges.items():
+            place = self.x[-1], np.degrees(angle)
+            write(self.axes, f"edge {edge} on\nthe palm", place, (4, 0), **look)
 
     def draw_paths(self) -> None:
         """The plan, each phase with its number on or beside it."""
@@ -224,14 +228,6 @@ class _Drawing:
             leader = np.array([find_middle(line), place]) / self.scale
             add_line(self.axes, leader, color=INK, lw=0.8, zorder=8.5)
             self._write(leader[1], str(number), **look)
-
-    def name_palm_lines(self) -> None:
-        """Say beside the axes which edge lies on the palm."""
-        look: Any = {"ha": "left", "va": "center", "fontsize": 7.6}
-        edges = {b.points[0, 1]: b.contacts[0].index for b in self.chart.borders if b.along == "x"}
-        for angle, edge in edges.items():
-            place = self.x[-1], np.degrees(angle)
-            write(self.axes, f"edge {edge} on\nthe palm", place, (4, 0), **look)
 
     def draw_legend(self) -> None:
         """What lines and colours mean."""
