@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -201,20 +201,16 @@ class Trial:
             simulation = self.simulate(changes, what, self.uncertainty.tolerance)
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
-        if isinstance(what, ClosedLoop):
-            return self._take_windows(what, simulation).judge(simulation)
-        return self.judge(simulation, changes.get("delay", 0.0))
-
-    def _take_windows(self, loop: ClosedLoop, simulation: FreeSimulation) -> Trial:
-        """The trial with phases as a policy has begun them, from when their torques take effect."""
-        end = float(simulation.t[-1])
-        began = {number: time + loop.delay for number, time in loop.began.items()}
-        last = self.windows[-1].phase
-        windows = []
+        if not isinstance(what, ClosedLoop):
+            return self.judge(simulation, changes.get("delay", 0.0))
+        # A phase begins when its first torques take effect; the last one goes on to the end.
+        end, windows = float(simulation.t[-1]), list[TimeWindow]()
+        began = {number: time + what.delay for number, time in what.began.items()}
+        began[self.windows[-1].phase + 1] = end
         for window in self.windows:
-            stop = end if window.phase == last else began.get(window.phase + 1, math.inf)
-            windows.append(window._replace(start=began.get(window.phase, end), stop=stop))
-        return replace(self, windows=tuple(windows))
+            start, stop = began.get(window.phase, end), began.get(window.phase + 1, math.inf)
+            windows.append(window._replace(start=start, stop=stop))
+        return replace(self, windows=tuple(windows)).judge(simulation)
 
     def simulate(
         self,
@@ -260,9 +256,10 @@ class Trial:
         """The first planned contact that is lost, its phase and when, and the least c_n.
 
         A phase goes on from when the last one's contact was gained to when its own is, or to its
-        end by the clock. Where a start is off, contacts are not closed yet, and are not lost so.
+        end by the clock. A contact is lost that opens for longer than 1e-3 units of time. One that
+        is open at the start, which may be off, has `MOMENT` to close for good.
         """
-        unit = self.problem.scene.scales.time
+        unit, t = self.problem.scene.scales.time, simulation.t
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
             gains = [s.start for s in simulation.stretches if s.contact == window.gained]
@@ -274,13 +271,15 @@ class Trial:
             planned = window.stop + delay
             stop = min(planned, gain, made)
             for name in window.contacts:
-                aliases = window.aliases.get(name, ())
-                time, force = _find_loss(simulation, name, aliases, began, stop, unit)
-                least = min(least, force)
-                if time is not None:
-                    losses.append((time, window.phase, name))
+                c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
+                least = min(least, float(np.nanmin(c_n, initial=math.inf)))
+                pauses = simulation.list_pauses(name, began, stop, window.aliases.get(name, ()))
+                if pauses and pauses[0][0] <= began:
+                    pauses = [pause for pause in pauses if pause[1] > began + MOMENT * unit]
+                lasting = [first for first, after in pauses if after - first > 1e-3 * unit]
+                losses += [(first, window.phase, name) for first in lasting]
             began = max(planned, gain) if window.gained else planned
-            if began > simulation.t[-1]:
+            if began > t[-1]:
                 # What ends the whole motion may be a little short: that is for the goal to say.
                 if window is not self.windows[-1]:
                     losses.append((planned, window.phase, window.gained))
@@ -289,29 +288,6 @@ class Trial:
             return "", None, None, least
         first, phase, name = min(losses)
         return name, phase, first, least
-
-
-def _find_loss(
-    simulation: FreeSimulation,
-    name: str,
-    aliases: Collection[str],
-    start: float,
-    stop: float,
-    unit: float,
-) -> tuple[float | None, float]:
-    """When a contact opens for longer than 1e-3 units of time, if it does; and its least c_n.
-
-    One that is open at the start has `MOMENT` to close for good.
-    """
-    column = simulation.contacts.index(name)
-    t, c_n = simulation.t, simulation.c_n[:, column]
-    here = (t >= start) & (t < stop)
-    forces = c_n[here & (c_n == c_n)]
-    least = float(forces.min()) if len(forces) else math.inf
-    pauses = simulation.list_pauses(name, start, stop, aliases)
-    if pauses and pauses[0][0] <= start:
-        pauses = [pause for pause in pauses if pause[1] > start + MOMENT * unit]
-    return next((first for first, after in pauses if after - first > 1e-3 * unit), None), least
 
 
 def make_trial(

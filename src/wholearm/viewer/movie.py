@@ -72,10 +72,8 @@ class _Scene:
     def draw(self, t: float) -> list[Artist]:
         """Everything at an instant, in the order of drawing."""
         axes, motion, artists = self._axes, self._trajectory, list[Artist]()
-        row, z = (
-            max(0, int(np.searchsorted(motion.t, t, side="right")) - 1),
-            _blend(motion.t, motion.z, t),
-        )
+        row = max(0, int(np.searchsorted(motion.t, t, side="right")) - 1)
+        z = _blend(motion.t, motion.z, t)
         if self._ghost is not None:
             behind = _blend(self._ghost.t, self._ghost.z, t)
             artists += snapshots.draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
