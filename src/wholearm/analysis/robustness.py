@@ -36,8 +36,7 @@ from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
 from ..verification.free import MOMENT, REACHED, TURNED, list_aliases
 
-Task = tuple[int, tuple[float, ...]]
-"""Number and values of a sample."""
+Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
 
 def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:

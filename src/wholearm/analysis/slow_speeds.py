@@ -128,11 +128,12 @@ def _predict_phase(
         chosen = np.append(True, same) | np.append(same, True)
         chosen[::8] = True
         torques = QuasistaticTorques(*(part[chosen] for part in torques))
-    unit = problem.scene.scales.speed
-    survivals = tuple(
-        _survive(path, name, evaluate, way, problem.epsilon, unit)
-        for name, (evaluate, way) in motions.items()
-    )
+    unit, survivals = problem.scene.scales.speed, list[Survival]()
+    for name, (evaluate, way) in motions.items():
+        speed, again, least = find_break(evaluate, problem.epsilon, unit)
+        lost, *_ = find_break(evaluate, 0.0, unit, speed or 0.0)
+        duration = way / speed if speed else None
+        survivals.append(Survival(name, speed, duration, lost, again, _name(path, least)))
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
     held = (grasp.least >= problem.epsilon) & (path.inertia > 0)
@@ -146,7 +147,7 @@ def _predict_phase(
         kept=tuple(
             (_place(path, run.start), _place(path, run.stop - 1)) for run in find_runs(held)
         ),
-        survivals=survivals,
+        survivals=tuple(survivals),
         torques=torques,
         curves=_draw(survivals, motions, unit),
     )
@@ -179,15 +180,6 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
     return QuasistaticTorques(path.s, path.z, forces.tau(zero, zero, internal), c_n)
 
 
-def _survive(
-    path: PathSamples, name: str, evaluate: Evaluate, way: float, epsilon: float, unit: float
-) -> Survival:
-    speed, again, least = find_break(evaluate, epsilon, unit)
-    lost, *_ = find_break(evaluate, 0.0, unit, speed or 0.0)
-    duration = way / speed if speed else None
-    return Survival(name, speed, duration, lost, again, _name(path, least))
-
-
 def _name(path: PathSamples, least: Least) -> Weakest:
     limits = [path.force_limits.limits.limits[k] for k in least.limits]
     contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
@@ -206,15 +198,10 @@ def _place(path: PathSamples, row: int) -> Place:
 
 
 def _draw(
-    survivals: tuple[Survival, ...], motions: dict[str, tuple[Evaluate, float]], unit: float
+    survivals: Sequence[Survival], motions: dict[str, tuple[Evaluate, float]], unit: float
 ) -> Curves:
     """Least forces over speed, about those at which something breaks."""
-    every = [
-        speed
-        for survival in survivals
-        for speed in (survival.speed, survival.lost, survival.again)
-        if speed
-    ]
+    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
     ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
     speeds = np.geomspace(*ends, 61)
     forces = {
@@ -234,8 +221,7 @@ class Least(NamedTuple):
     limits: tuple[int, ...]  # what keeps it from being more, as indices into the limits of the path
 
 
-Evaluate = Callable[[float], Least]
-"""What presses least at a speed [m/s]."""
+Evaluate = Callable[[float], Least]  # what presses least at a speed [m/s]
 
 
 class UnitProfile(NamedTuple):

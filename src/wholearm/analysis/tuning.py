@@ -76,12 +76,9 @@ class TrialOutcome(Enum):
 
     RESTS = "rests"
     """The object does not begin to slide, stops short of the end of the phase, or turns back."""
-    ARRIVES = "arrives"
-    """The end of the phase is reached."""
-    LOSES = "loses"
-    """A contact parts, or presses with less than epsilon."""
-    LASTS = "lasts"
-    """The object is still on its way when the trial is over."""
+    ARRIVES = "arrives"  # the end of the phase is reached
+    LOSES = "loses"  # a contact parts, or presses with less than epsilon
+    LASTS = "lasts"  # the object is still on its way when the trial is over
 
 
 class TuningStep(NamedTuple):

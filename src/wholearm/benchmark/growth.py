@@ -28,7 +28,6 @@ SIZES = {
     "phases": (3, 6, 12, 25, 50),
     "vertices": (6, 12, 25, 50, 100),
 }
-"""Sizes by what grows."""
 WORK = {
     "intervals": ("least time", "margin"),
     "phases": ("least time",),

@@ -122,7 +122,6 @@ class PeerPlan(NamedTuple):
 
 
 NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))))
-"""What there is where nothing was found."""
 
 
 def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
@@ -322,7 +321,6 @@ TOLERANCES = {
     FEW: ("0.0001", *(f"1e-{k:02}" for k in range(6, 14))),
     MANY: ("1e-06", "1e-09", "1e-12"),
 }
-"""Tolerances of each study."""
 
 
 def build_own(course: Course, setting: str) -> Callable[[], Array]:
@@ -382,7 +380,6 @@ SIMULATORS = {
         TOLERANCES,
     ),
 }
-"""Simulators by name."""
 
 
 def run_simulator(
@@ -680,8 +677,10 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
     def continuous(arg: Any) -> None:
         for index in arg.phase_list:
             phase, part = arg.phase[index], curve.segments[index]
+            # CasADi symbols in wrappers.
             state, control = (
-                [_strip(x) for x in symbols] for symbols in (phase.state, phase.control)
+                [(x if hasattr(x, "_value") else x.item())._value for x in symbols]
+                for symbols in (phase.state, phase.control)
             )
             z, v = ca.vertcat(*state[:5]), ca.vertcat(*state[5:])
             tau, c_n = ca.vertcat(*control[:2]), ca.vertcat(*control[2:])
@@ -700,11 +699,6 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
     ocp.functions.objective, ocp.functions.continuous = objective, continuous
     if len(curve.segments) > 1:
         ocp.functions.discrete = discrete
-
-
-def _strip(symbol: Any) -> Any:
-    """The CasADi symbol in a wrapper."""
-    return symbol._value if hasattr(symbol, "_value") else symbol.item()._value
 
 
 def _read(solution: Any) -> PeerPlan:
@@ -747,11 +741,9 @@ PLANNERS = {
         "toppra",
     ),
 }
-"""Planners by name."""
 
 
-METHODS = SIMULATORS | PLANNERS
-"""All methods by name, in the order of the tables."""
+METHODS = SIMULATORS | PLANNERS  # all methods by name, in the order of the tables
 MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
 
 

@@ -137,6 +137,10 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
         "period": {"control_period": 2e-3},
         "dwell": {"settle": "10 %"},
     }
+
+    def plan_anew(problem: Problem) -> Trajectory:
+        return solve(problem, replay=False).trajectory
+
     for way in dict.fromkeys(["printed", *ways]):
         started = time.process_time()
         part: Row = {}
@@ -145,7 +149,7 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
                 printed = solve(build_problem(table | tomllib.loads(answer.to_text())), objective)
                 part["off"] = printed.value / answer.plan.value - 1
             elif way == "policy":
-                policy = make_policy(printed.problem, printed.trajectory, planner=_plan_anew)
+                policy = make_policy(printed.problem, printed.trajectory, planner=plan_anew)
                 report = verify_policy(printed.problem, printed.trajectory, policy)
                 part["why"] = "; ".join(report.failures)
             else:
@@ -161,11 +165,6 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
     if abs(off := row["ways"]["printed"]["off"]) > SAME:
         row["findings"] = [f"as printed: off by {off:.2g}"]
     return row
-
-
-def _plan_anew(problem: Problem) -> Trajectory:
-    """What a policy plans anew, as the command `policy` does."""
-    return solve(problem, replay=False).trajectory
 
 
 def _sum_up(way: str, solved: Sequence[Row]) -> list[str] | None:

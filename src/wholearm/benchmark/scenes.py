@@ -309,7 +309,6 @@ TWISTS: dict[str, Callable[[Random, Table], Table]] = {
     "rough": _rough,
     "smooth": _smooth,
 }
-"""Changes that make a scene special."""
 
 Phases = list[dict[str, Any]]
 Stops = list[tuple[float, float]]

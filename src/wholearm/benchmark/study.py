@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Case = tuple[Any, ...]
-"""Plain values that say what is run: the name of its record, too."""
+Case = tuple[Any, ...]  # plain values that say what is run: the name of its record, too
 Row = dict[str, Any]
 """What came of a case, as plain values; `findings` is what must not be.
 

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 MOST = 24  # panels, and lines of a panel
 SHARE = 0.08  # of the points of a panel, from which their reason is written there
-Lines = Mapping[str, Sequence[Row]]
-"""Rows by what they have in common."""
+Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
 
 
 def choose_axes(

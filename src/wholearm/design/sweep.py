@@ -39,10 +39,8 @@ from ..problem.read import name_keys
 from ..search import solve
 from .parameters import Parameter, find_parameter, require_allowed
 
-Point = tuple[Any, ...]
-"""Index of a problem, and the value of each parameter."""
-Row = dict[str, Any]
-"""What came of a point, as plain values; see `Sweep`."""
+Point = tuple[Any, ...]  # index of a problem, and the value of each parameter
+Row = dict[str, Any]  # what came of a point, as plain values; see `Sweep`
 CHECKS = ("verify", "free", "policy")
 """What plans can be tried with: the replay with given contacts, without, and as a policy."""
 ACTIVE = 1e-3  # slack below which a limit counts as active, over the unit of its shortfalls

@@ -99,16 +99,23 @@ def describe_motion(
     scene, pushes = problem.scene, place_pushes(problem.scene, trajectory)
     styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)
-    contacts = [
-        {
-            "name": name,
-            "colour": styles[name].colour,
-            "dashes": [] if styles[name].line == "-" else list(styles[name].line[1]),
-            "friction": scene.friction.of(parse_contact(name, scene).finger),
-            "spans": _list_spans(scene, trajectory, pushes, index, rows),
-        }
-        for index, name in enumerate(trajectory.contacts)
-    ]
+    contacts = list[dict[str, Any]]()
+    for index, name in enumerate(trajectory.contacts):
+        c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
+        # When the contact presses: the first row, and from there on places, normals and forces.
+        spans = [
+            {
+                "first": run.start,
+                "point": _fix(pushes.points[rows[run], index], scene),
+                "normal": _fix(pushes.normals[rows[run], index], scene),
+                "c": _round(c[run]),
+            }
+            for run in find_runs(np.isfinite(c).all(axis=1), least=2)
+        ]
+        dashes = [] if styles[name].line == "-" else list(styles[name].line[1])
+        friction = scene.friction.of(parse_contact(name, scene).finger)
+        look = {"name": name, "colour": styles[name].colour, "dashes": dashes}
+        contacts.append(look | {"friction": friction, "spans": spans})
     behind = None
     if ghost is not None:
         few = _choose_rows(ghost, every[:0], most)
@@ -132,22 +139,6 @@ def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
     joints = np.flatnonzero(np.diff(trajectory.phase)) + 1
     ends = np.concatenate([[0, count - 1], joints - 1, joints, steps - 1, steps])
     return np.union1d(np.arange(0, count, -(-count // most)), ends).astype(np.int64)
-
-
-def _list_spans(
-    scene: Scene, trajectory: Trajectory, pushes: Pushes, index: int, rows: Numbers
-) -> list[dict[str, Any]]:
-    """When a contact presses: the first row, and from there on places, normals and forces."""
-    c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
-    return [
-        {
-            "first": run.start,
-            "point": _fix(pushes.points[rows[run], index], scene),
-            "normal": _fix(pushes.normals[rows[run], index], scene),
-            "c": _round(c[run]),
-        }
-        for run in find_runs(np.isfinite(c).all(axis=1), least=2)
-    ]
 
 
 def describe_hand(scene: Scene) -> dict[str, Any]:
