@@ -1,6 +1,6 @@
 """Figures of plans and replays: snapshots of hand and object, force margins, and joint torques.
 
-Functions return figures or the artists they drew; nothing is shown and no global state is touched.
+Functions return figures or draw on axes; nothing is shown and no global state is touched.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.scale import SymmetricalLogTransform
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
@@ -49,15 +47,14 @@ def draw_margins(
     epsilon: float,
     styles: style.Styles,
     covered: Array | None = None,
-) -> list[Line2D]:
+) -> None:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
-    Returns one line per contact, labelled with its name and broken where forces step. The scale
-    covers further margins `covered` [N], of any shape, too.
+    Lines are labelled with the names of contacts and broken where forces step. The scale covers
+    further margins `covered` [N], of any shape, too.
     """
     steps, margins = trajectory.find_steps(), trajectory.c_n - epsilon
     t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
-    lines = []
     for index, name in enumerate(trajectory.contacts):
         # Where margins coincide the earlier, wider line stays visible beside the later one.
         rank = index / max(1, len(trajectory.contacts) - 1)
@@ -66,11 +63,10 @@ def draw_margins(
         # Up to a step the line keeps its last value.
         ends = np.column_stack([margins[steps - 1, index], np.full(len(steps), np.nan)]).ravel()
         values = np.insert(margins[:, index], np.repeat(steps, 2), ends)
-        lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
+        axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
     every = margins.ravel() if covered is None else np.append(margins, covered)
     scale_margins(axes, every, epsilon)
-    return lines
 
 
 def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
@@ -122,21 +118,18 @@ def draw_cones(
     scene: Scene,
     styles: style.Styles,
     simulation: Simulation | None = None,
-) -> list[Line2D]:
-    """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
-
-    Returns one line per contact that rolls, labelled with its name.
-    """
+) -> None:
+    """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip."""
     fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
     mu = np.array([scene.friction.of(finger) for finger in fingers])
     shares = trajectory.c_t / np.where(trajectory.rolling, mu * trajectory.c_n, np.nan)
     steps = trajectory.find_steps()
-    t, lines = np.insert(trajectory.t, steps, np.nan), []
+    t = np.insert(trajectory.t, steps, np.nan)
     for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
         name = trajectory.contacts[index]
         look: Any = {"color": styles[name].colour, "linestyle": styles[name].line, "zorder": 3}
         values = np.insert(shares[:, index], steps, np.nan)
-        lines += axes.plot(t, values, linewidth=1.8, label=name, **look)
+        axes.plot(t, values, linewidth=1.8, label=name, **look)
     for edge in (-1.0, 1.0):
         axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
         axes.axhspan(edge, 1.25 * edge, color=style.LOST, linewidth=0, zorder=1.5)
@@ -147,14 +140,10 @@ def draw_cones(
         rolls = trajectory.rolling[first][simulation.phase]
         values = simulation.c_t / np.where(rolls, mu * simulation.c_n, np.nan)
         axes.plot(simulation.t, values, **SIMULATED)
-    return lines
 
 
-def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2D]:
-    """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m].
-
-    Returns the lines of finger 1 and finger 2.
-    """
+def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> None:
+    """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m]."""
     # Both ends of every piece, and between them as many places as show.
     pieces, _, order = torque.coefficients.shape
     x = np.linspace(-1.0, 1.0, 2 if order <= 2 else max(order, math.ceil(2000 / pieces)))
@@ -162,10 +151,9 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
     coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
     tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
     t, tau = (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
-    lines = []
     for index, (colour, _) in enumerate(style.FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
-        lines += axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)
+        axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)
     for index, (colour, _) in enumerate(style.FINGERS):
         # Dashes that alternate keep both limits visible where they are equal.
         look = {"color": colour, "linewidth": 1.0, "linestyle": (6 * index, (5, 7)), "zorder": 2}
@@ -176,7 +164,6 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
     prefix, factor = style.choose_prefix(reach)
     axes.set(ylim=(-reach, reach), ylabel=f"joint torque $\\tau$ [{prefix}N m]")
     _scale_ticks(axes, factor)
-    return lines
 
 
 def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
@@ -198,10 +185,8 @@ def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
         axes.grid(axis="y", color=style.GRID, linewidth=0.4)
 
 
-def draw_simulation(
-    margins: Axes, torques: Axes, simulation: Simulation, epsilon: float
-) -> list[Line2D]:
-    """Draw simulated margins and torques over the planned ones; returns the lines."""
+def draw_simulation(margins: Axes, torques: Axes, simulation: Simulation, epsilon: float) -> None:
+    """Draw simulated margins and torques over the planned ones."""
     t = simulation.t
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
@@ -210,13 +195,12 @@ def draw_simulation(
     other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
     for index, look in enumerate((SIMULATED, SIMULATED | other)):
         label = f"simulated {index + 1}"
-        lines += torques.plot(t, simulation.tau[:, index], label=label, **look)
-    return lines
+        torques.plot(t, simulation.tau[:, index], label=label, **look)
 
 
 def draw_phases(
     axes: Axes, starts: Array, *, labels: bool = True, span: float | None = None
-) -> list[Artist]:
+) -> None:
     """Shade every other phase and write each one's number above it, where there is room.
 
     Numbers of phases too short for them stand above the axes in two rows.
@@ -225,12 +209,11 @@ def draw_phases(
     must be at their final place, which decides what there is room for; they cover `span` [s], or
     just the phases.
     """
-    artists: list[Artist] = []
     points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
     taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
     for index, (start, end) in enumerate(pairwise(starts)):
         colour = "white" if index % 2 else style.BAND
-        artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))
+        axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5)
         middle, text = points * (start + end) / 2, f"phase {index + 1}"
         if 6.5 * len(text) >= points * (end - start):
             text = str(index + 1)
@@ -240,8 +223,7 @@ def draw_phases(
             continue
         taken[row] = middle + half
         place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
-        artists.append(style.write(axes, text, place, (0, 4 + 10 * row), xycoords=units))
-    return artists
+        style.write(axes, text, place, (0, 4 + 10 * row), xycoords=units)
 
 
 if TYPE_CHECKING:
