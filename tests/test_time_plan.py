@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -34,7 +35,7 @@ from scenes import (
     tip,
     tipped,
 )
-from shipped import FOLDER, HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
+from shipped import FOLDER, HEPTAGON, IMPACTS, LANDING, plan_of, problem_of, tipping
 from timed import (
     fastest_landing,
     instants,
@@ -898,3 +899,12 @@ def test_the_least_square_over_a_polygon_is_that_of_a_solver() -> None:
         answer = minimize(lambda u, g=slope: g @ u + 0.4 * u @ u, np.zeros(2), constraints=limits)
         assert least[k] == pytest.approx(answer.fun, abs=1e-6)
     assert len(set(np.round(least, 6))) > 10
+
+
+def test_small_turns_take_the_root_of_their_angle() -> None:
+    """Bang-bang acceleration over short ways, whose ends are less than a milliradian off."""
+    start = math.degrees(tipping().start[2])
+    angles = np.array([1e-4, 5e-4])
+    problems = [tipping(start + math.degrees(angle)) for angle in angles]
+    times = [solve(problem, time_intervals=10).value for problem in problems]
+    assert times[1] / times[0] == pytest.approx(math.sqrt(angles[1] / angles[0]), rel=0.01)
