@@ -330,21 +330,17 @@ def list_touching(problem: Problem, phase: Phase) -> Formation:
 class DwellAllocation(NamedTuple):
     """Relative dwell times of ends that gain a contact."""
 
-    first: int  # how many of the first have another time
-    more: float  # that time, over the others
+    first: float  # time of the first of them, over the others
     last: float  # time of the plan's last end
-    firm: bool = False  # as of `DwellEnd`
+    firm: bool  # as of `DwellEnd`
 
 
-WAYS = (
-    DwellAllocation(1, 2.0, 1.0, firm=True),
-    DwellAllocation(1, 0.0, 0.0, firm=True),
-    DwellAllocation(1, 2.0, 1.0),
-    DwellAllocation(2, 3.5, 1.0),
-    DwellAllocation(2, 2.0, 1.0),
-    DwellAllocation(1, 0.0, 0.0),
+ALLOCATIONS = (
+    DwellAllocation(2.0, 1.0, firm=True),
+    DwellAllocation(0.0, 0.0, firm=True),  # heptagon at 5 %
+    DwellAllocation(0.0, 0.0, firm=False),  # heptagon_twice at 5 %
 )
-"""Allocations in the order in which they are tried."""
+"""Allocations in the order in which they are tried, with problems that take them."""
 STOP = 0.06  # relative dwell time of an end that gains no contact
 
 
@@ -358,20 +354,20 @@ def share_time(
     times = [problem.settles(phase) for phase in problem.phases]
     whole = problem.settle_share * sum(plan.motion.duration for plan in plans)
     best, least = list[DwellEnd | None](), math.inf
-    for way in WAYS:
+    for allocation in ALLOCATIONS:
         weights, gained = np.zeros(len(times)), 0
         for k, place in enumerate(places):
             if place is None or times[k] is not None:
                 continue
             closes = find_opening(place) is not None
-            weights[k] = (way.more if gained < way.first else 1.0) if closes else STOP
+            weights[k] = (1.0 if gained else allocation.first) if closes else STOP
             gained += closes
-        if gained > way.first:
-            weights[-1] *= way.last
+        if gained > 1:
+            weights[-1] *= allocation.last
         shares = whole * weights / max(float(weights.sum()), STOP**2)
         pairs = zip(shares.tolist(), times, strict=True)
         allotted = [share if time is None else time for share, time in pairs]
-        ends = find_ends(problem, places, allotted, way.firm)
+        ends = find_ends(problem, places, allotted, allocation.firm)
         off = measure_off(problem, plans, ends) if any(ends) else 0.0
         if not best or off < 0.8 * least:  # a later one has to be better by a fifth
             best, least = ends, off
