@@ -33,7 +33,6 @@ from ..common.files import require_ending, require_writable, together, write_tex
 from ..common.signals import check, guard, listen
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
-from . import design
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -95,6 +94,10 @@ SEARCH = """\
 --time-limit S    longest time that this may take; a search then returns the best route so far
     (none) in 1e-3..1e9
 """
+
+PLANNING = re.sub(r"^--samples .*\n", "", PLANNER, flags=re.M) + MARGIN
+"""Options of the planner but the rows of trajectory files, which are not written."""
+OBJECTIVE = PLANNING[: PLANNING.index("--accuracy")]
 
 TABLE = f"""\
 [[new]]  write_problem  write a problem file to begin with
@@ -232,7 +235,51 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
 {JSON}\
-{design.TABLE}\
+[[sweep]]  sweep  plan a grid of other values of the numbers in problem files
+problems PROBLEM ...   problem files (TOML)
+--vary NAME=VALUES ...  what is varied, by the names of Problem.with_: LOW:HIGH:COUNT, or
+    VALUE,VALUE,... of numbers or words, as in torque_limit=1:3:5 phases[5].until.phi_deg=-50,-45;
+    LOW:HIGH with --samples
+--samples N            points of a Latin hypercube of all ranges in place of the grid = 0
+    in 0..1000000
+--seed K               of the samples = 0 in 0..9223372036854775808
+--with CHECKS          what plans are tried with: verify, free, policy, or several with commas
+-o --output FILE       table to write (.csv; default: NAME_PARAMETERS.csv). Rows are kept in a
+    .jsonl file beside it as they come; a sweep that is there goes on where it was stopped
+--fresh                begin these files anew, whatever they hold
+--figure FILE          also draw (.png, .pdf, .svg) a curve over one parameter, contours over two,
+    small multiples over three
+--jobs N               worker processes (default: all cores) in 1..256
+--scheduler ADDRESS    run on the cluster of this Dask scheduler (extra: cluster)
+--time-limit S         longest time for one point (none) in 1e-3..1e9
+{PLANNING}\
+--json                 print the result as JSON
+[[sensitivities]]  sensitivities  see what 1 percent more of each number in a problem file is worth
+problem            problem file (TOML)
+[plan]             trajectory file (.npz) of its plan, whose objective and options count
+--of NAME ...      these numbers alone, by the names of Problem.with_ (default: all but corners)
+--differences      between solved problems, also where multipliers give derivatives
+-o --output FILE   figure to write (.png, .pdf, .svg): a bar for each number
+--jobs N           processes (default: all cores) in 1..256
+{PLANNING}\
+--json             print the result as JSON
+[[design]]  find_hand  find the hand that does a job best
+problems PROBLEM ...   problem files (TOML), for one hand
+--over NAME=LOW:HIGH ...  numbers to choose and their ranges, by the names of Problem.with_, as in
+    length1=0.1:0.25 base1_x=0.06:0.1 (required)
+--minimise NAME        time, effort or -margin = time among time|effort|-margin
+--symmetric            let what is said of one finger hold for the other, mirrored
+--weights W ...        weights of several problems (equal ones)
+--worst                of several problems let the worst one count, and not the weighted sum
+--starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
+--budget N             most hands of each search, and most until its first feasible one = 80
+    in 1..100000
+-o --output FILE       problem file to write (.toml; default: NAME_design.toml); of several problems
+    that of the first one
+--figure FILE          also draw the path of the search (.png, .pdf, .svg)
+--jobs N               processes (default: all cores) in 1..256
+{PLANNING.replace(OBJECTIVE, "")}\
+--json                 print the result as JSON
 [[animate]]  animate  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
@@ -266,7 +313,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        options = build_parser().parse_args(prepare(given))
+        words = prepare(given)
+        options = build_parser(words).parse_args(words)
         with progress_log():
             status: int = options.run(options)
         sys.stdout.flush()
@@ -300,34 +348,18 @@ def _silence_output() -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are ours, and which can be filled when it is first used.
-
-    Pairs of numbers that begin with a minus are no options.
-    """
+    """A parser whose errors are ours; pairs of numbers that begin with a minus are no options."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._negative_number_matcher = re.compile(r"-\.?\d")
-        self.fill: Callable[[], object] | None = None
-
-    def complete(self) -> None:
-        """Add what is left out until then."""
-        fill, self.fill = self.fill, None
-        if fill is not None:
-            fill()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, with all options; a command refuses what it does not know in its own name."""
-        self.complete()
+        """Parse; a command refuses what it does not know in its own name."""
         parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, unknown
-
-    def format_help(self) -> str:
-        """The help, with all options."""
-        self.complete()
-        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
@@ -349,8 +381,8 @@ def add_options(parser: argparse.ArgumentParser, table: str) -> None:
         option.add(parser)
 
 
-def build_parser() -> Parser:
-    """Return the parser of all commands."""
+def build_parser(given: Sequence[str] | None = None) -> Parser:
+    """The parser of all commands; of the studies, those alone that a command line asks for."""
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     version = f"wholearm {wholearm.__version__}"
     parser.add_argument("--version", action="version", version=version, help="print the version")
@@ -360,10 +392,21 @@ def build_parser() -> Parser:
         name, run, text = re.split(r" {2,}", head)
         subparser = add_parser(commands, name.strip("[]"), text)
         add_options(subparser, table)
-        subparser.set_defaults(run=globals().get(run) or getattr(design, run))
+        subparser.set_defaults(run=globals()[run])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
-    bench.fill = partial(_fill_bench, bench)
+    bench.set_defaults(run=_list_studies)
+    if given is None or given[:1] == ["bench"]:
+        # They are imported when they are used.
+        from ..benchmark import STUDIES
+
+        studies = bench.add_subparsers(metavar="STUDY")
+        for name, text in STUDIES.items():
+            subparser = add_parser(studies, name, text)
+            if given is None or name in given[1:2]:
+                study = load_study(name)
+                add_options(subparser, study.list_options())
+                subparser.set_defaults(run=partial(_run_study, study))
     return parser
 
 
@@ -472,6 +515,29 @@ def finish(
     return 0 if result is None else result.exit_status
 
 
+def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Options that are given, of those with some names."""
+    values = {name: getattr(options, name, None) for name in names}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def save_figure(path: str | None, function: str, result: Result) -> None:
+    """Draw a result by a function of the package, ``module:name``, if a file is given for it."""
+    if path is not None:
+        module, name = function.split(":")
+        draw = getattr(import_module(f"wholearm.{module}"), name)
+        wholearm.plots.save(draw(result), path)
+
+
+def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
+    """What starts the processes of a study, on a cluster if its scheduler is given."""
+    from ..common.parallel import Processes, connect
+
+    if options.scheduler is not None:
+        return partial(connect, options.scheduler)
+    return partial(Processes, options.jobs)
+
+
 def stem_of(path: str) -> str:
     """The name of a file without folder and ending."""
     return os.path.splitext(os.path.basename(path))[0]
@@ -542,10 +608,7 @@ def solve(options: argparse.Namespace) -> int:
     from ..scene.model import find_unit_hint
 
     output = options.output or f"{stem_of(options.problem)}.npz"
-    values = {key: getattr(options, key) for key in keys_of(wholearm.PlanOptions)}
-    plan_options = wholearm.PlanOptions(
-        **{k: value for k, value in values.items() if value is not None}
-    )
+    plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
     _check_sampling(options)
@@ -558,7 +621,7 @@ def solve(options: argparse.Namespace) -> int:
     route_text = ""
     try:
         if problem.goals:
-            answer = find_route(options, problem, plan_options)
+            answer = find_route(options, problem)
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
@@ -612,7 +675,7 @@ def verify(options: argparse.Namespace) -> int:
     """Replay torques, and print the verdict."""
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
-    values = {key: value for key in keys if (value := getattr(options, key)) is not None}
+    values = list_given(options, *keys)
     _check_free(options)
     policy, notes = None, dict[str, list[str]]()
     torques: wholearm.Trajectory | wholearm.TorqueProfile
@@ -672,9 +735,11 @@ def plot(options: argparse.Namespace) -> int:
         trajectory = wholearm.simulate(problem, torques, progress=show_progress()).trajectory
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
-        width = {} if options.width is None else {"width": options.width}
         figure = wholearm.plots.force_margins(
-            trajectory, simulation=simulation, motion=options.motion, **width
+            trajectory,
+            simulation=simulation,
+            motion=options.motion,
+            **list_given(options, "width"),
         )
     wholearm.plots.save(figure, options.output)
     return finish(options, None, options.output)
@@ -703,10 +768,7 @@ def predict(options: argparse.Namespace) -> int:
         raise InputError("", "--speed", "is for --torques FILE, the torques to write")
     problem = read_problem(options)
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress())
-    if options.output is not None:
-        from ..figures.analysis_figures import draw_prediction
-
-        wholearm.plots.save(draw_prediction(prediction), options.output)
+    save_figure(options.output, "figures.analysis_figures:draw_prediction", prediction)
     status = finish(options, prediction)
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
@@ -717,7 +779,7 @@ def predict(options: argparse.Namespace) -> int:
 def tune(options: argparse.Namespace) -> int:
     """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
     require_output(options.output, ".csv")
-    values = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
+    values = list_given(options, "brake", "stops", "squeeze", "share")
     tuning = wholearm.tune(wholearm.load(options.problem), **values, progress=show_progress())
     output = options.output if tuning.ok else None
     if output is not None:
@@ -730,16 +792,12 @@ def compare(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem = wholearm.load(options.problem)
     comparison = wholearm.compare(problem, options.files, show_progress())
-    if options.output is not None:
-        from ..figures.analysis_figures import draw_comparison
-
-        wholearm.plots.save(draw_comparison(comparison), options.output)
+    save_figure(options.output, "figures.analysis_figures:draw_comparison", comparison)
     return finish(options, comparison, options.output)
 
 
 def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
-    from ..common.parallel import Processes, connect
     from ..problem.definition import spread_widths
 
     # A file for each study that differs by more than numbers: its problem, phase and policy.
@@ -763,9 +821,6 @@ def robustness(options: argparse.Namespace) -> int:
             raise InputError("", "--vary", fault) from None
     ranges = problem.ranges | spread_widths(widths, "range of {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
-    start: Callable[[], Executor] = partial(Processes, options.jobs)
-    if options.scheduler is not None:
-        start = partial(connect, options.scheduler)
     study = wholearm.assess_robustness(
         problem,
         plan,
@@ -778,21 +833,17 @@ def robustness(options: argparse.Namespace) -> int:
         policy=policy,
         path=output,
         fresh=options.fresh,
-        start=start,
+        start=choose_workers(options),
         progress=show_progress(),
     )
-    if options.figure is not None:
-        from ..figures.analysis_figures import draw_robustness
-
-        wholearm.plots.save(draw_robustness(study), options.figure)
+    save_figure(options.figure, "figures.analysis_figures:draw_robustness", study)
     return finish(options, study, output, options.figure, notes=notes)
 
 
 def route(options: argparse.Namespace) -> int:
     """Find a route, print its phases, and draw it if that is asked for."""
     require_output(options.output)
-    plan_options = wholearm.PlanOptions(objective=options.objective)
-    answer = find_route(options, read_problem(options), plan_options, options.alternatives)
+    answer = find_route(options, read_problem(options), options.alternatives)
     clear_progress()
     print(
         f"{json.dumps(answer.to_dict(), indent=2)}\n" if options.json else answer.to_text(), end=""
@@ -804,26 +855,20 @@ def route(options: argparse.Namespace) -> int:
 
 
 def find_route(
-    options: argparse.Namespace,
-    problem: wholearm.Problem,
-    plan_options: wholearm.PlanOptions,
-    alternatives: int = 0,
+    options: argparse.Namespace, problem: wholearm.Problem, alternatives: int = 0
 ) -> wholearm.Answer:
     """Find a route, with a progress line, in two processes if nothing else is asked for."""
     from ..common.parallel import count_cores
-    from ..search.find_route import find_route_with
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = _warn
-        return find_route_with(
+        return wholearm.find_route(
             problem,
-            plan_options,
-            alternatives,
-            show_progress(),
-            None if options.cache is None else Path(options.cache),
-            min(2, count_cores()) if options.jobs is None else options.jobs,
-            time_limit=options.time_limit,
+            **list_given(options, "cache", "time_limit", *keys_of(wholearm.PlanOptions)),
+            alternatives=alternatives,
+            progress=show_progress(),
+            jobs=min(2, count_cores()) if options.jobs is None else options.jobs,
             hurry=hasten,
         )
 
@@ -874,9 +919,7 @@ def draw_map(options: argparse.Namespace) -> int:
     plan = None if options.plan is None else wholearm.load_trajectory(options.plan)
     if plan is not None:
         tell_origin(problem, ("plan", options.plan, plan.meta), silent=bool(poses))
-    margin = options.uniqueness_margin
-    limit = {} if margin is None else {"uniqueness_margin": margin}
-    _save_map(problem, plan, output, phi, **limit)
+    _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
     print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
 
@@ -958,9 +1001,8 @@ def policy(options: argparse.Namespace) -> int:
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    values = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
-    allowed = {} if options.departure is None else {"departure": options.departure}
-    say = show_progress()
+    values = list_given(options, "reserve", "period", "delay", "torque_limit")
+    allowed, say = list_given(options, "departure"), show_progress()
 
     def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
         return wholearm.solve(own, replay=False, progress=say).trajectory
@@ -1020,6 +1062,77 @@ def policy(options: argparse.Namespace) -> int:
     if not options.json:
         print(f"{made.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return status
+
+
+def sweep(options: argparse.Namespace) -> int:
+    """Plan all points, print and write their table, and draw it if that is asked for."""
+    from ..design.sweep import read_vary
+    from ..problem.read import read_problem
+
+    vary = read_vary(options.vary, options.samples)
+    parts = [stem_of(options.problems[0]), *(re.sub(r"\W+", "_", name).strip("_") for name in vary)]
+    output = options.output or f"{'_'.join(parts)}.csv"
+    require_output(output, ".csv")
+    require_output(options.figure)
+    if options.figure is not None:
+        from ..design.figures import choose_axes
+
+        choose_axes(vary, options.samples, len(options.problems))
+    # Here `samples` are points, not rows of a trajectory.
+    names = "seed", "time_limit", "fresh", *keys_of(wholearm.PlanOptions)
+    result = wholearm.sweep(
+        [read_problem(path) for path in options.problems],
+        vary,
+        **list_given(options, *names),
+        checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
+        path=f"{os.path.splitext(output)[0]}.jsonl" if require_ending(output, ".csv") else None,
+        start=choose_workers(options),
+        progress=show_progress(),
+    )
+    write_text(output, result.to_csv())
+    save_figure(options.figure, "design.figures:draw_sweep", result)
+    return finish(options, result, output, options.figure)
+
+
+def sensitivities(options: argparse.Namespace) -> int:
+    """Print a table of sensitivities, and draw it if that is asked for."""
+    require_output(options.output)
+    problem, notes = wholearm.load(options.problem), dict[str, list[str]]()
+    plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
+    if options.plan is not None:
+        problem, _, _, notes = load_plan(options, options.plan, options.json)
+        plan_options = wholearm.load_plan(options.plan).options
+    result = wholearm.find_sensitivities(
+        problem,
+        plan_options,
+        options.of or (),
+        options.jobs,
+        show_progress(),
+        not options.differences,
+    )
+    save_figure(options.output, "design.figures:draw_sensitivities", result)
+    return finish(options, result, options.output, notes=notes)
+
+
+def find_hand(options: argparse.Namespace) -> int:
+    """Find the best hand, write its problem files, and draw the search if that is asked for."""
+    outputs = [f"{stem_of(path)}_design.toml" for path in options.problems]
+    outputs[:1] = [options.output or outputs[0]]
+    for path in outputs:
+        require_output(path, ".toml")
+    require_output(options.figure)
+    names = "symmetric", "weights", "worst", "starts", "budget", "jobs"
+    result = wholearm.design_hand(
+        [wholearm.load(path) for path in options.problems],
+        options.over,
+        options.minimise,
+        **list_given(options, *names, *keys_of(wholearm.PlanOptions)),
+        progress=show_progress(),
+    )
+    for plan, path in zip(result.plans, outputs, strict=True):
+        wholearm.save(plan.problem, path)
+    save_figure(options.figure, "design.figures:draw_search", result)
+    return finish(options, result, *outputs, options.figure)
 
 
 def gallery(options: argparse.Namespace) -> int:
@@ -1115,7 +1228,6 @@ def complete(options: argparse.Namespace) -> int:
 
 def _complete_files(parser: Parser, files: object, folders: object) -> None:
     """Let all arguments that name files or folders be completed so."""
-    parser.complete()
     named = {"problem", "plan", "trajectory", "torques", "files", "output"}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -1163,23 +1275,6 @@ def show_schema(options: argparse.Namespace) -> int:
     require_writable(options.output)
     write_text(options.output, text)
     return finish(options, None, options.output)
-
-
-def _fill_bench(bench: Parser) -> None:
-    """Give the parser of ``bench`` its studies, which are imported when they are used."""
-    from ..benchmark import STUDIES
-
-    studies = bench.add_subparsers(metavar="STUDY", parser_class=Parser)
-    for name, text in STUDIES.items():
-        parser = add_parser(studies, name, text)
-        parser.fill = partial(_fill_study, parser, name)
-    bench.set_defaults(run=_list_studies)
-
-
-def _fill_study(parser: Parser, name: str) -> None:
-    study = load_study(name)
-    add_options(parser, study.list_options())
-    parser.set_defaults(run=partial(_run_study, study))
 
 
 def load_study(name: str) -> Study:
