@@ -7,7 +7,7 @@ import json
 import math
 import tomllib
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +24,8 @@ from wholearm import Formation, Goal, Phase, PlanOptions, Problem, load_plan, ve
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, SolverError
+from wholearm.common.files import make_folder
+from wholearm.common.parallel import share
 from wholearm.common.signals import OutOfTime
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.closing import place as place_at
@@ -39,9 +41,8 @@ from wholearm.mapping.formation_list import (
     split_leg,
     tolerance,
 )
-from wholearm.planning.blocks import BlockPlan
 from wholearm.planning.lower_bound import bound_least_time
-from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.phase_plan import PhasePlan, end_of
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import (
@@ -65,19 +66,18 @@ from wholearm.search.cuts import (
     list_openings,
 )
 from wholearm.search.edge_plans import (
-    BackgroundTask,
-    Cache,
     CoarsePlan,
-    PlannedEdge,
+    Lost,
+    PlannedPhase,
     list_printed,
-    plan_edges,
+    plan_part,
+    split_route,
 )
 from wholearm.search.edges import Edge
 from wholearm.search.find_route import (
     find_route,
     format_phases,
     load_roadmap,
-    require_folder,
     store_roadmap,
 )
 from wholearm.search.places import make_place, require_reach
@@ -152,7 +152,7 @@ def test_a_problem_with_a_goal_is_planned() -> None:
 def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     _, route = to_edge_6()
     folder = tmp_path / "new"
-    require_folder(folder)
+    make_folder(str(folder))
     store_roadmap(folder, "one", chart())
     known = load_roadmap(folder, "one")
     assert known is not None and load_roadmap(folder, "other") is None
@@ -165,8 +165,8 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
         file.write_bytes(damaged)
         assert load_roadmap(folder, "one") is None
-    with pytest.raises(InputError, match="--cache"):
-        require_folder(file)
+    with pytest.raises(InputError, match=f"{file.name}: cannot be made: File exists"):
+        find_route(read({"flush": 0, "x": 0.03}), cache=file)
 
 
 def test_what_blocks_is_said() -> None:
@@ -199,7 +199,7 @@ def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
         find_route(read({"flush": 6}), time_limit=1e-9)
-    monkeypatch.setattr("wholearm.search.astar.plan_edges", interrupt)
+    monkeypatch.setattr("wholearm.search.astar.plan_part", interrupt)
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
 
@@ -240,9 +240,8 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     planned = [
         PhasePlan(own, plan.trajectory.torque, own.duration) for own in plan.trajectory.motions
     ]
-    block = BlockPlan(plan.problem.phases, plan.problem.start, planned, None)
-    edges = [PlannedEdge(plan.problem.phases, (block,))]
-    phases = list_printed(plan.problem.scene, edges, guesses=True)
+    pairs = list(zip(plan.problem.phases, planned, strict=True))
+    phases = list_printed(plan.problem.scene, pairs, guesses=True)
     printed = replace(plan.problem, phases=phases)
     again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
     over_time = [phase.number for phase in plan.phases if phase.modes]
@@ -308,32 +307,37 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
-def plan_all(
-    edges: tuple[Edge, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
-) -> list[PlannedEdge]:
-    own = [(edge, list[CoarsePlan]()) for edge in edges]
-    planned = plan_edges(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
-    assert isinstance(planned, list), planned
-    return planned
-
-
-def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
+def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
     problem = problem_of(HEPTAGON)
     search = RouteSearch(
         Roadmap(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6)
     )
     route = next(search.run())
-    assert len(route.edges) > 1
-    kept: Cache = {}
-    asides = [BackgroundTask(lambda: 7) for _ in range(2)]
-    one = plan_all(route.edges, {}, 1, asides[0])
-    other = plan_all(route.edges, kept, 2, asides[1])
-    assert [own.result for own in asides] == [None, 7]
-    assert list(map(id, plan_all(route.edges, kept, 1))) == list(map(id, other))
-    # Solves in another process may differ in the last bits, and by the solver's tolerance then.
-    for mine, theirs in zip(one, other, strict=True):
-        assert mine.duration == pytest.approx(theirs.duration, rel=1e-6)
-        assert mine.end == pytest.approx(theirs.end, abs=1e-6)
+    parts = split_route(route.edges)
+    assert tuple(edge for part in parts for edge in part) == route.edges
+    assert len(parts) > 1 and not any(part[-1].in_cell for part in parts[:-1])
+
+    def plan(part: list[Edge]) -> list[PlannedPhase] | Lost:
+        begin = replace(problem, start=part[0].start.z)
+        return plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
+
+    tasks = [partial(plan, part) for part in parts]
+    for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
+        assert isinstance(one, list) and isinstance(other, list), (one, other)
+        # Solves in another process may differ in the last bits, and by the solver's tolerance then.
+        for (_, mine), (_, theirs) in zip(one, other, strict=True):
+            assert mine.motion.duration == pytest.approx(theirs.motion.duration, rel=1e-6)
+            assert end_of(mine)[0] == pytest.approx(end_of(theirs)[0], abs=1e-6)
+
+
+def test_edges_that_cannot_be_planned_are_named() -> None:
+    """With next to no torque the first edge has no plan, on any route."""
+    _, route = to_edge_6()
+    problem = problem_of(HEPTAGON).with_(torque_limit=0.02)
+    edges = [(edge, None) for edge in split_route(route.edges)[0]]
+    lost = plan_part(problem, edges, OPTIONS, lambda _: None)
+    assert isinstance(lost, Lost) and lost.edges == (route.edges[0],)
+    assert "until" in lost and "phase 1" in lost
 
 
 @pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])
@@ -402,8 +406,8 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
 
 def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None:
     near = tolerance(heptagon.scene)
-    for share in (0.0, 0.9, -0.9):
-        ends = [on_border(heptagon, phi) + share * near for phi in (PHI, PHI + 0.15)]
+    for off in (0.0, 0.9, -0.9):
+        ends = [on_border(heptagon, phi) + off * near for phi in (PHI, PHI + 0.15)]
         (part,) = split_leg(heptagon.scene, *ends)
         assert len(part.contacts) == 4 and part.coordinate == 1
         for place, end in ((part.start, ends[0]), (part.stop, ends[1])):

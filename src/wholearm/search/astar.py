@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, pairwise
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
 from ..common.signals import beat
@@ -26,14 +26,15 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Goal, Problem
 from .edge_plans import (
-    BackgroundTask,
     CoarsePlan,
     Lost,
+    PlannedPhase,
     list_printed,
     look_ahead,
     plan_coarsely,
-    plan_edges,
+    plan_part,
     plan_phases,
+    split_route,
     time_with,
 )
 from .edges import ROUGHLY, Blocked, Edge, describe_steps, leave_at
@@ -52,7 +53,6 @@ FASTER = 0.7  # least ratio of planned to straight-path durations through cells;
 AGREES = 1 + 1e-4  # ratio of a plan of printed phases to those of the edges, above which another
 # initial guess is tried
 TRIED = 6  # most routes without a plan, beyond those asked for
-OTHERS = 2  # most slower plans of an edge that are tried if the fastest fails the replay
 BEYOND = 1.1  # largest estimate of a route over that of the best one
 NEARBY = 30  # most places of `find_first`
 MEASURED, MORE = 24, 8  # most edges planned until there is a route, and after it
@@ -270,7 +270,7 @@ class RoutePlanner:
     """Routes of a search, and plans of those that seem best."""
 
     problem: Problem
-    before: list[Route]  # routes to the goals before
+    before: Plan | None  # to the goals before
     search: RouteSearch
     options: PlanOptions
     jobs: int = 1  # most processes at the same time
@@ -280,8 +280,13 @@ class RoutePlanner:
     failures: list[str] = field(default_factory=list)  # why routes have no plan
     _prefetched: dict[Edge, CoarsePlan | None] = field(default_factory=dict)
     _measurements: int = 0
-    _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
+    _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
+
+    @property
+    def _spent(self) -> float:
+        """Duration of the plan to the goals before [s]."""
+        return self.before.duration if self.before else 0.0
 
     @property
     def roadmap(self) -> Roadmap:
@@ -354,27 +359,32 @@ class RoutePlanner:
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
-        every = [edge for r in (*self.before, route) for edge in r.edges]
-        edges = [(edge, self.roadmap.coarse_plans.get(edge, [])[: 1 + OTHERS]) for edge in every]
-        if problem is not self.problem:
-            # Their guesses are of other motors.
-            edges = [(edge, [m._replace(begun=[]) for m in plans]) for edge, plans in edges]
-        background = None
-        if self.jobs > 1 and not self.before and self._bound is None:
+        options, coarse = options.scale_ranges(problem.ranges), self.roadmap.coarse_plans
+        tasks = list[Task[Any]]()
+        for part in split_route(route.edges):
+            edges = [(edge, coarse[edge][0] if edge.in_cell else None) for edge in part]
+            begin = replace(problem, start=part[0].start.z)
+            # Coarse plans of other motors are no guesses.
+            tasks.append(partial(plan_part, begin, edges, options, report, problem is self.problem))
+        parts, enough = len(tasks), BEYOND * self.estimate(route)
+        if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
-            enough = BEYOND * self.estimate(route)
-            background = BackgroundTask(partial(bound_borders, self.search, enough))
-            self._bound = enough, background
-        planned = plan_edges(
-            problem, edges, options, self.roadmap.joined, report, self.jobs, background
-        )
-        if isinstance(planned, Lost):
-            return planned
-        reached = sum(edge.duration for edge in planned)
+            tasks.append(partial(bound_borders, self.search, enough))
+        results = self._share(tasks)
+        for bound in results[parts:]:
+            self._bound = enough, bound
+        planned = list[PlannedPhase]()
+        for result in results[:parts]:
+            if isinstance(result, Lost):
+                return result
+            planned += result
+        before = self.before.problem.phases if self.before else ()
+        reached = self._spent + sum(plan.motion.duration for _, plan in planned)
         best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
-            phases = list_printed(scene, planned, guesses)
+            phases = (*before, *list_printed(scene, planned, guesses))
+            phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
             if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
@@ -385,9 +395,8 @@ class RoutePlanner:
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
-        enough, task = self._bound or (0.0, None)
-        bound = task.result if task else None
         wanted = duration if in_cells else math.inf
+        enough, bound = self._bound or (0.0, None)
         if bound is None or min(enough, wanted) <= bound.value < wanted:
             return bound_borders(self.search, wanted)
         return bound.up_to(wanted)
@@ -486,8 +495,8 @@ class RoutePlanner:
 
     def estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
-        total = 0.0
-        for edge in (edge for r in (*self.before, route) for edge in r.edges):
+        total = self._spent
+        for edge in route.edges:
             if plans := self.roadmap.coarse_plans.get(edge):
                 total += plans[0].duration
             else:

@@ -229,7 +229,7 @@ def _search_changed(
     search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
-    planner = RoutePlanner(changed, [], search, rough, first_only=True)
+    planner = RoutePlanner(changed, None, search, rough, first_only=True)
     try:
         route = planner.find_first(lambda _: None, most)
         if route is None:

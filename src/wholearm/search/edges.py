@@ -167,8 +167,7 @@ class EdgeStep(NamedTuple):
 class Edge:
     """An edge of the roadmap: phases from rest at one place to rest at another.
 
-    `estimate` orders the search, `bound` is below every plan; `edge_plans` has its plans: a coarse
-    one through a cell (`plan_coarsely`), and the accurate ones of a route (`plan_edges`).
+    `estimate` orders the search, `bound` is below every plan.
     """
 
     start: RoadmapPlace

@@ -12,7 +12,8 @@ import sys
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,7 @@ import numpy as np
 from .. import __version__
 from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError
-from ..common.files import write_whole
+from ..common.files import make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..planning.options import Objective, PlanOptions
@@ -44,6 +45,7 @@ ROADMAPS = 4  # scenes whose roadmaps are kept in memory
 _roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
 
+@exclusive
 def find_route(
     problem: Problem,
     objective: str = "time",
@@ -53,6 +55,7 @@ def find_route(
     cache: str | Path | None = None,
     jobs: int = 1,
     time_limit: float | None = None,
+    hurry: Callable[[], None] | None = None,
     **options: Any,
 ) -> Answer:
     """Find the contact formations that lead from a problem's start to its goals, and a plan.
@@ -75,6 +78,9 @@ def find_route(
         depend on it.
     time_limit : float, optional, [s]
         Longest time that the search may take; then the best route so far is returned.
+    hurry : callable, optional
+        With it an interrupt ends the search alone: the best route so far is returned, or planned,
+        which it is called before. Without it KeyboardInterrupt is raised.
     **options
         As `wholearm.solve` takes them.
 
@@ -86,57 +92,40 @@ def find_route(
     """
     if jobs < 1:
         raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
-    chosen = PlanOptions(objective=objective, **options)
-    folder = None if cache is None else Path(cache)
-    return find_route_with(
-        problem, chosen, alternatives, progress, folder, jobs, time_limit=time_limit
-    )
-
-
-@exclusive
-def find_route_with(
-    problem: Problem,
-    options: PlanOptions,
-    alternatives: int = 0,
-    progress: Callable[[str], None] | None = None,
-    cache: Path | None = None,
-    jobs: int = 1,
-    *,
-    time_limit: float | None = None,
-    hurry: Callable[[], None] | None = None,
-) -> Answer:
-    """Find a route with `options` given as one object; see `find_route`.
-
-    With `hurry` an interrupt ends the search alone: the best route so far is returned, or planned,
-    which `hurry` is called before. Without it KeyboardInterrupt is raised.
-    """
+    plan_options = PlanOptions(objective=objective, **options)
     with limited(time_limit):
         report = Reporter(progress)
         if not problem.goals:
             reason = "is missing; allowed is flush or phi_deg, and x"
             raise InputError(problem.source, "goal", reason)
         if cache is not None:
-            require_folder(cache)
-        roadmap, before = get_roadmap(problem, options, cache), list[Route]()
+            make_folder(str(cache))
+        key = describe_key(problem, plan_options)
+        roadmap = get_roadmap(problem, plan_options, key, cache)
+        before, start = list[Answer](), problem.start
         for index, goal in enumerate(problem.goals):
-            start = problem.start if not before else before[-1].stop.z
             place = make_place(problem.scene, start)
             if is_at(place, goal):
-                key = name_goal(problem.goals, index)
                 reason = f"{goal} holds already where the motion starts"
-                raise InputError(problem.source, key, reason)
+                raise InputError(problem.source, name_goal(problem.goals, index), reason)
             require_reach(problem.scene, goal, float(start[2]))
-            search = RouteSearch(roadmap, place, goal)
+            planner = RoutePlanner(
+                problem,
+                before[-1].plan if before else None,
+                RouteSearch(roadmap, place, goal),
+                plan_options,
+                jobs,
+            )
             count = alternatives if index + 1 == len(problem.goals) else 0
-            answer = _plan_to_goal(problem, before, search, options, count, report, jobs, hurry)
-            before = [*before, answer.route]
+            before.append(_plan_to_goal(planner, count, report, hurry))
+            start = before[-1].route.stop.z
         if cache is not None:
             try:
-                store_roadmap(cache, describe_key(problem, options), roadmap)
+                store_roadmap(Path(cache), key, roadmap)
             except InputError as error:
                 # The result counts, with or without a copy for later searches.
                 warnings.warn(str(error), stacklevel=2)
-        return answer
+        return before[-1]
 
 
 def describe_key(problem: Problem, options: PlanOptions) -> str:
@@ -145,12 +134,13 @@ def describe_key(problem: Problem, options: PlanOptions) -> str:
     return json.dumps(key, sort_keys=True)
 
 
-def get_roadmap(problem: Problem, options: PlanOptions, cache: Path | None = None) -> Roadmap:
+def get_roadmap(
+    problem: Problem, options: PlanOptions, key: str, cache: str | Path | None
+) -> Roadmap:
     """The roadmap of a problem's scene, from memory, from a folder, or a new one."""
-    key = describe_key(problem, options)
     roadmap = _roadmaps.pop(key, None)
     if roadmap is None and cache is not None:
-        roadmap = load_roadmap(cache, key)
+        roadmap = load_roadmap(Path(cache), key)
     _roadmaps[key] = roadmap = roadmap or Roadmap(problem, options.uniqueness_margin)
     while len(_roadmaps) > ROADMAPS:
         _roadmaps.popitem(last=False)
@@ -163,24 +153,17 @@ def forget_roadmaps() -> None:
 
 
 def _plan_to_goal(
-    problem: Problem,
-    before: list[Route],
-    search: RouteSearch,
-    options: PlanOptions,
-    alternatives: int,
-    report: Reporter,
-    jobs: int,
-    hurry: Callable[[], None] | None,
+    planner: RoutePlanner, alternatives: int, report: Reporter, hurry: Callable[[], None] | None
 ) -> Answer:
     """Plan routes to one goal, with a lower bound of the best one."""
-    start = time.process_time()
-    planner, complete = RoutePlanner(problem, before, search, options, jobs), True
+    start, complete, search, made = time.process_time(), False, planner.search, planner.made
     try:
         with yielding():
             report("looking for routes")
             planner.run(1 + alternatives, report)
+        complete = True
     except OutOfTime:
-        if not planner.made:
+        if not made:
             text = f"the time limit is over, and there is no plan yet: {len(search.reached)} places"
             text += " looked at"
             if planner.found:
@@ -189,60 +172,56 @@ def _plan_to_goal(
                 duration = planner.estimate(best)
                 text += f", a route of {count} phases found, of about {duration:.3g} s"
             raise SolverError(f"{text}; what it was at: {report.last}") from None
-        complete = False
     except KeyboardInterrupt:
-        if hurry is None or not (planner.made or planner.found):
+        if hurry is None or not (made or planner.found):
             raise
-        complete = False
-        if not planner.made:
+        if not made:
             hurry()
             planner.first_only = True
             planner.plan(1, report)
     except np.linalg.LinAlgError:
         # Dependent contacts at a place that the search has reached.
-        complete = False
-        if not planner.made:
+        if not made:
             planner.plan(1, report)
-    made = planner.made
     if not made:
-        spent, failed = time.process_time() - start, planner.failures
-        opening, changes, reason = (
-            "",
-            tuple[Change, ...](),
-            partial(explain_block, problem, options),
-        )
-        try:
-            with yielding():
-                opening, changes = find_opening(search, problem, options, spent, report)
-                text = describe_block(search, failed, opening, reason)
-        except KeyboardInterrupt as error:
-            if hurry is None and not isinstance(error, OutOfTime):
-                raise
-            text = describe_block(search, failed, opening)
-        raise InfeasibleError(text, changes=changes)
-    sign = -1 if options.goal is Objective.MARGIN else 1
+        raise _explain(planner, time.process_time() - start, report, hurry)
+    sign = -1 if planner.options.goal is Objective.MARGIN else 1
     made.sort(key=lambda pair: sign * pair[0].value)
     plan, route = made[0]
     bound = None
-    if complete and not before:
-        try:
-            with yielding():
-                bound = planner.bound(plan.duration, route.in_cells)
-        except KeyboardInterrupt as error:
-            if hurry is None and not isinstance(error, OutOfTime):
-                raise
-            complete = False
+    if complete and not planner.before:
+        complete = False
+        with _ending(hurry):
+            bound = planner.bound(plan.duration, route.in_cells)
+            complete = True
     others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
     failures, blocked = tuple(planner.failures), tuple(search.blocked)
     return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
 
 
-def require_folder(folder: Path) -> None:
-    """Make a folder for roadmaps; InputError if that fails."""
+@contextmanager
+def _ending(hurry: Callable[[], None] | None) -> Iterator[None]:
+    """Have an interrupt end what is done here alone, as far as it may, or the end of the time."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("", "--cache", f"{folder}: {error.strerror}") from None
+        with yielding():
+            yield
+    except KeyboardInterrupt as error:
+        if hurry is None and not isinstance(error, OutOfTime):
+            raise
+
+
+def _explain(
+    planner: RoutePlanner, seconds: float, report: Reporter, hurry: Callable[[], None] | None
+) -> InfeasibleError:
+    """Why nothing leads to a goal, after so many seconds of search [s]."""
+    search, problem, options = planner.search, planner.problem, planner.options
+    opening, changes, text = "", tuple[Change, ...](), ""
+    with _ending(hurry):
+        opening, changes = find_opening(search, problem, options, seconds, report)
+        explain = partial(explain_block, problem, options)
+        text = describe_block(search, planner.failures, opening, explain)
+    text = text or describe_block(search, planner.failures, opening)
+    return InfeasibleError(text, changes=changes)
 
 
 def load_roadmap(folder: Path, key: str) -> Roadmap | None:

@@ -156,15 +156,9 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
 
 
 def require_reach(scene: Scene, goal: Goal, near: float) -> None:
-    """Check that both fingers close on an object that lies at a goal.
+    """Raise an InfeasibleError if the fingers do not close on an object at a goal.
 
-    Parameters
-    ----------
-    near : [rad]  angle of the object before
-
-    Raises
-    ------
-    InfeasibleError  if they do not; says where they would
+    It says where they would. The angle of the object before is `near` [rad].
     """
     if goal.x is None:
         return

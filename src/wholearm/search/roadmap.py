@@ -33,7 +33,7 @@ from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
-from .edge_plans import CoarsePlan, PlannedEdge
+from .edge_plans import CoarsePlan
 from .edges import (
     Blocked,
     BorderEdge,
@@ -137,10 +137,9 @@ class Roadmap:
 
     Attributes
     ----------
-    plans     plans of routes, or why there are none; see `edge_plans`
-    measured  plans of single edges through cells, the best first; empty if there are none
-    refined   edges whose place on the border has been optimized
-    joined    plans of edges from rest to rest, or why there are none; see `edge_plans`
+    plans         plans of phases, or why there are none; see `edge_plans`
+    coarse_plans  plans of single edges through cells, the best first; empty if there are none
+    refined       edges whose place on the border has been optimized
     """
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
@@ -152,7 +151,6 @@ class Roadmap:
         self._chains: dict[Key, list[Chain]] = {}
         self._cells: dict[Key, list[Edge]] = {}
         self.plans: dict[object, Plan | str] = {}
-        self.joined: dict[tuple[object, ...], PlannedEdge | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
         self._releases: dict[BorderEdge, list[Edge]] = {}
         self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
