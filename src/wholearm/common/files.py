@@ -21,12 +21,7 @@ LARGEST = 2**28  # largest array that is read [byte]: a million rows of everythi
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Check, before long work, that a file can be written at `path`.
-
-    Raises
-    ------
-    InputError  if it is a folder, or its folder does not exist or cannot be written to
-    """
+    """Raise an `InputError`, before long work, if no file can be written at `path`."""
     target = os.fspath(path)
     folder = os.path.dirname(os.path.realpath(target))
     if os.path.isdir(target):
@@ -39,11 +34,9 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 
 
 def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
-    """Return the ending of a file's name, in small letters; a device or a pipe needs none.
+    """The ending of a file's name, in small letters, or an `InputError` if it is not allowed.
 
-    Raises
-    ------
-    InputError  if it is none of those that are allowed
+    A device or a pipe needs none.
     """
     ending = os.path.splitext(path)[1].lower()
     if ending not in allowed and not _is_special(os.fspath(path)):
@@ -53,17 +46,13 @@ def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
-    """Write a file through a temporary one beside it, renamed when complete.
+    """Write a file through a temporary one beside it, renamed when complete, or an `InputError`.
 
     Parameters
     ----------
     path   where the file is to appear; an existing file is replaced, and what is not a file (a
            device, a pipe) is written to
     write  receives the open binary file
-
-    Raises
-    ------
-    InputError  if the file cannot be written
     """
     target = os.fspath(path)
     try:
@@ -111,12 +100,7 @@ def read_json(path: str) -> Any:
 
 
 def make_folder(path: str) -> None:
-    """Make a folder if it is not there.
-
-    Raises
-    ------
-    InputError  if it cannot be made
-    """
+    """Make a folder if it is not there; an `InputError` if it cannot be made."""
     try:
         os.makedirs(path, exist_ok=True)
     except OSError as error:
@@ -168,11 +152,8 @@ on_end(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
 def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
     """Read the named arrays of an archive, as far as it has them.
 
-    Nothing is unpickled, and no array takes more memory than its bytes in the file.
-
-    Raises
-    ------
-    InputError  if the file cannot be read, is no archive of arrays, or claims what it does not hold
+    Nothing is unpickled, and no array takes more memory than its bytes in the file. An `InputError`
+    if it cannot be read, is no archive of arrays, or claims what it does not hold.
     """
     # A command that reads none has no use for these, nor for NumPy.
     import zipfile

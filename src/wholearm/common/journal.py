@@ -71,12 +71,7 @@ class Journal:
         self._stream.close()
 
     def add(self, record: dict[str, Any]) -> None:
-        """Keep a record.
-
-        Raises
-        ------
-        InputError  if it cannot be written
-        """
+        """Keep a record; an `InputError` if it cannot be written."""
         self.records.append(record)
         try:
             self._write((json.dumps(record) + "\n").encode())

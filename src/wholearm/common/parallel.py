@@ -406,16 +406,9 @@ def _work(pipe: Connection, parent: int) -> None:
 
 
 def connect(address: str, patience: float = 10.0) -> Executor:
-    """An executor on the workers of a Dask scheduler.
+    """An executor on the workers of a Dask scheduler, such as ``tcp://10.0.0.1:8786``.
 
-    Parameters
-    ----------
-    address         such as ``tcp://10.0.0.1:8786``
-    patience : [s]  how long to wait for an answer
-
-    Raises
-    ------
-    InputError  if Dask is not installed, or no scheduler answers there
+    An `InputError` if Dask is not installed, or no scheduler answers within `patience` [s].
     """
     try:
         from distributed import Client

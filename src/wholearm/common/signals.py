@@ -240,12 +240,7 @@ class OutOfTime(KeyboardInterrupt):
 
 @contextmanager
 def limited(seconds: float | None) -> Iterator[None]:
-    """Have `beat` raise OutOfTime once so many seconds are over; None leaves an outer limit.
-
-    Raises
-    ------
-    InputError  if the limit is not a positive number
-    """
+    """Have `beat` raise OutOfTime once so many seconds are over; None leaves an outer limit."""
     global _deadline
     if seconds is None:
         yield

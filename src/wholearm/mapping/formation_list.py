@@ -210,7 +210,7 @@ Walked = tuple[Step, Array]  # a phase, and the configuration at its end
 
 
 def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:
-    """Phases along a leg, with their final configurations.
+    """Phases along a leg, with their final configurations; an `InputError` if there are none.
 
     A phase with two degrees of freedom ends at the nearest place, not on the leg, except for the
     last one.
@@ -220,10 +220,6 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
     index                        number of the first phase, from 0
     z : (5,)                     configuration at the start
     start, stop : (2,) [m, rad]  x and phi at the ends of the leg
-
-    Raises
-    ------
-    InputError  if the leg cannot be followed
     """
     walked: list[Walked] = []
     parts, near = split_leg(problem.scene, start, stop), tolerance(problem.scene)

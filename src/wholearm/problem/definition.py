@@ -418,10 +418,6 @@ def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     ----------
     changes  by name of the parameter: relative, or in the parameter's unit. Those of torques and of
              the start do nothing here.
-
-    Raises
-    ------
-    InputError  if a number makes no sense any more
     """
 
     def change(name: str) -> float:

@@ -99,9 +99,7 @@ ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `c
 def read_problem(path: str) -> Problem:
     """Read and validate a problem file; whether each phase can be reached is not checked here.
 
-    Raises
-    ------
-    InputError  if the file cannot be read or anything in it is malformed
+    An `InputError` if it cannot be read, or for the first thing in it that is malformed.
     """
     try:
         with open(path, "rb") as stream:
@@ -122,12 +120,7 @@ def read_problem(path: str) -> Problem:
 
 @exclusive
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
-    """Validate a problem given as the nested tables of a problem file.
-
-    Raises
-    ------
-    InputError  if anything in it is malformed; names `source`
-    """
+    """The problem of a file's nested tables, or an `InputError` that names `source`."""
     with name_source(source):
         check_keys(table, "", TOP)
         polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
@@ -162,9 +155,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
 def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
     """The problem whose tables the `meta` of a trajectory carries along.
 
-    Raises
-    ------
-    InputError  if there is none, or it is malformed; names `source`, the file of the trajectory
+    An `InputError` that names `source`, its file, if there is none, or it is malformed.
     """
     table = meta.get("problem")
     if not isinstance(table, Mapping) or not table:
@@ -369,12 +360,7 @@ def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
 
 @exclusive
 def check_problem(problem: Problem) -> None:
-    """Check a problem; whether each phase can be reached is not checked here.
-
-    Raises
-    ------
-    InputError  for the first thing that is wrong
-    """
+    """Raise an `InputError` for the first thing that is wrong; curves of phases are not traced."""
     check_ranges(problem.scene)
     for attribute, field in keys_of(Problem).items():
         value = field.read(getattr(problem, attribute), field.name)
@@ -417,12 +403,7 @@ def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
 
 
 def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
-    """The goals of a problem file, in the order in which they are visited.
-
-    Raises
-    ------
-    InputError  if what is given is neither a table nor a list of tables, or a key is unknown
-    """
+    """The goals of a problem file, in the order in which they are visited, or an `InputError`."""
     given, goals = table.get("goal", []), list[Goal]()
     several = isinstance(given, list)
     for index, entry in enumerate(given if several else [given], start=1):
@@ -445,12 +426,7 @@ def name_goal(goals: Sequence[Goal], index: int) -> str:
 
 
 def require_phases(problem: Problem) -> None:
-    """Check that there is something to plan or to replay: a problem for a map needs no phases.
-
-    Raises
-    ------
-    InputError  if the problem has no phases
-    """
+    """Raise an `InputError` if a problem has no phases, which one for a map does not need."""
     if not problem.phases:
         text = "is missing, and so is [goal], from which wholearm finds them; "
         text += "`wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
