@@ -159,7 +159,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     problem = problem_of(HEPTAGON)
     own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
     again = next(own.run())
-    assert again.signature == route.signature and again.estimate == route.estimate
+    assert again.key == route.key and again.estimate == route.estimate
     (file,) = folder.iterdir()
     written = file.read_bytes()
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):

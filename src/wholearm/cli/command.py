@@ -538,11 +538,6 @@ def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
     return partial(Processes, options.jobs)
 
 
-def stem_of(path: str) -> str:
-    """The name of a file without folder and ending."""
-    return os.path.splitext(os.path.basename(path))[0]
-
-
 def read_problem(options: argparse.Namespace) -> wholearm.Problem:
     """The problem of a command, whose phases are not traced."""
     from ..problem.read import read_problem
@@ -607,7 +602,7 @@ def solve(options: argparse.Namespace) -> int:
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
-    output = options.output or f"{stem_of(options.problem)}.npz"
+    output = options.output or f"{Path(options.problem).stem}.npz"
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
@@ -801,9 +796,9 @@ def robustness(options: argparse.Namespace) -> int:
     from ..problem.definition import spread_widths
 
     # A file for each study that differs by more than numbers: its problem, phase and policy.
-    parts = [stem_of(options.problem), "robustness"]
+    parts = [Path(options.problem).stem, "robustness"]
     parts += [] if options.phase is None else [f"phase{options.phase}"]
-    parts += [] if options.policy is None else [stem_of(options.policy)]
+    parts += [] if options.policy is None else [Path(options.policy).stem]
     parts += ["sensor"] if options.sensor else []
     output = options.output or f"{'_'.join(parts)}.jsonl"
     require_output(output, ".jsonl")
@@ -913,7 +908,7 @@ def draw_map(options: argparse.Namespace) -> int:
         print(wholearm.format_route(formations), end="")
         if options.output is None:
             return 0
-    output = options.output or f"map_{stem_of(options.problem)}.png"
+    output = options.output or f"map_{Path(options.problem).stem}.png"
     require_output(output)
     problem = read_problem(options)
     plan = None if options.plan is None else wholearm.load_trajectory(options.plan)
@@ -997,7 +992,7 @@ def policy(options: argparse.Namespace) -> int:
     from ..policy.make import find_widest
     from ..problem.read import read_own_problem
 
-    output = options.output or f"{stem_of(options.plan)}_policy.npz"
+    output = options.output or f"{Path(options.plan).stem}_policy.npz"
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
@@ -1070,7 +1065,10 @@ def sweep(options: argparse.Namespace) -> int:
     from ..problem.read import read_problem
 
     vary = read_vary(options.vary, options.samples)
-    parts = [stem_of(options.problems[0]), *(re.sub(r"\W+", "_", name).strip("_") for name in vary)]
+    parts = [
+        Path(options.problems[0]).stem,
+        *(re.sub(r"\W+", "_", name).strip("_") for name in vary),
+    ]
     output = options.output or f"{'_'.join(parts)}.csv"
     require_output(output, ".csv")
     require_output(options.figure)
@@ -1079,11 +1077,11 @@ def sweep(options: argparse.Namespace) -> int:
 
         choose_axes(vary, options.samples, len(options.problems))
     # Here `samples` are points, not rows of a trajectory.
-    names = "seed", "time_limit", "fresh", *keys_of(wholearm.PlanOptions)
+    given = list_given(options, "seed", "time_limit", "fresh", *keys_of(wholearm.PlanOptions))
     result = wholearm.sweep(
         [read_problem(path) for path in options.problems],
         vary,
-        **list_given(options, *names),
+        **given,
         checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
         path=f"{os.path.splitext(output)[0]}.jsonl" if require_ending(output, ".csv") else None,
         start=choose_workers(options),
@@ -1116,7 +1114,7 @@ def sensitivities(options: argparse.Namespace) -> int:
 
 def find_hand(options: argparse.Namespace) -> int:
     """Find the best hand, write its problem files, and draw the search if that is asked for."""
-    outputs = [f"{stem_of(path)}_design.toml" for path in options.problems]
+    outputs = [f"{Path(path).stem}_design.toml" for path in options.problems]
     outputs[:1] = [options.output or outputs[0]]
     for path in outputs:
         require_output(path, ".toml")
@@ -1171,7 +1169,7 @@ def report(options: argparse.Namespace) -> int:
     """Write the page of a problem and its plans."""
     from ..viewer.report_page import build_report
 
-    stem = stem_of(options.problem)
+    stem = Path(options.problem).stem
     output = options.output or f"{stem}.html"
     require_output(output, ".html")
     problem, say = read_problem(options), show_progress()
@@ -1257,7 +1255,7 @@ def write_problem(options: argparse.Namespace) -> int:
             raise InputError("", "--vertices", fault) from None
     with name_source("--vertices" if vertices is not None else ""):
         content = write_template(
-            stem_of(output), options.polygon, options.size, options.mass, vertices
+            Path(output).stem, options.polygon, options.size, options.mass, vertices
         )
     write_text(output, content)
     print(f"wrote {output}; next: wholearm solve {output}")

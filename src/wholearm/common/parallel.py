@@ -171,7 +171,7 @@ def _serve(
     except KeyboardInterrupt:
         return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
-        far.send_bytes(_pickle(results, known))
+        far.send_bytes(pickle_deep(results, known))
 
 
 def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
@@ -208,7 +208,11 @@ class _Unpickler(pickle.Unpickler):
         return self._known[pid]
 
 
-def _pickle(value: object, known: Sequence[object]) -> bytes:
+def pickle_deep(value: object, known: Sequence[object] = ()) -> bytes:
+    """A pickle of an object that is nested deeply, as places and edges of a roadmap are.
+
+    Objects that are `known` to who loads it are numbers in it.
+    """
     stream = io.BytesIO()
     deepest = sys.getrecursionlimit()
     sys.setrecursionlimit(max(deepest, 20_000))

@@ -271,12 +271,7 @@ def beat() -> None:
 
 
 class Reporter:
-    """Passes on what is being done, and remembers it.
-
-    Attributes
-    ----------
-    last
-    """
+    """Passes on what is being done, and remembers it as `last`."""
 
     def __init__(self, progress: Callable[[str], None] | None) -> None:
         self._progress, self.last = progress, "begun"

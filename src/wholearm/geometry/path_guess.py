@@ -229,14 +229,11 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         goals += [goal] if goal is not None else []
     metric = metric_weights(phase.formation.scene)
 
-    def distance(goal: Array) -> float:
-        return float(metric @ (goal - z) ** 2)
-
     if not goals:
         goal = explore(phase.formation, z, slip, endings)
         goals = [goal] if goal is not None else []
     if goals:
-        return min(goals, key=distance)
+        return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
     text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
     raise InputError("", key, text)
 

@@ -24,7 +24,7 @@ from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
-from ..problem.definition import Goal, Problem
+from ..problem.definition import Goal, Phase, Problem
 from .edge_plans import (
     CoarsePlan,
     Lost,
@@ -105,14 +105,10 @@ class Route:
         return any(edge.in_cell for edge in self.edges)
 
     @property
-    def signature(self) -> tuple[object, ...]:
-        """Names of the contacts of each phase."""
-        return tuple(part for edge in self.edges for part in edge.signature)
-
-    @property
     def key(self) -> object:
         """Its formations, and how phases end."""
-        return self.signature, tuple(step.end for edge in self.edges for step in edge.steps)
+        steps = (step for edge in self.edges for step in edge.steps)
+        return tuple((frozenset(step.contacts), step.end) for step in steps)
 
 
 Pending = Chain | Callable[[], list[Edge]] | None
@@ -274,6 +270,7 @@ class RoutePlanner:
     search: RouteSearch
     options: PlanOptions
     jobs: int = 1  # most processes at the same time
+    spent: float = 0.0  # [s]: estimated least time to the goals before
     first_only: bool = False  # whether any plan will do: then edges are not refined
     found: list[Route] = field(default_factory=list)  # their edges through cells have plans
     made: list[tuple[Plan, Route]] = field(default_factory=list)
@@ -282,11 +279,6 @@ class RoutePlanner:
     _measurements: int = 0
     _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
-
-    @property
-    def _spent(self) -> float:
-        """Duration of the plan to the goals before [s]."""
-        return self.before.duration if self.before else 0.0
 
     @property
     def roadmap(self) -> Roadmap:
@@ -338,7 +330,7 @@ class RoutePlanner:
     def _take_others(self, route: Route) -> bool:
         """Take the other plans of edges that last least by themselves; whether there are any.
 
-        The plan of goal 32 of the corpus does not hold in its replay otherwise.
+        A part of the route of goal 25 of the corpus has no plan otherwise.
         """
         plans = self.roadmap.coarse_plans
         several = [edge for edge in route.edges if len(plans.get(edge, ())) > 1]
@@ -378,8 +370,10 @@ class RoutePlanner:
             if isinstance(result, Lost):
                 return result
             planned += result
-        before = self.before.problem.phases if self.before else ()
-        reached = self._spent + sum(plan.motion.duration for _, plan in planned)
+        reached = sum(plan.motion.duration for _, plan in planned)
+        before: tuple[Phase, ...] = ()
+        if self.before:
+            before, reached = self.before.problem.phases, self.before.duration + reached
         best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
@@ -495,7 +489,7 @@ class RoutePlanner:
 
     def estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
-        total = self._spent
+        total = self.spent
         for edge in route.edges:
             if plans := self.roadmap.coarse_plans.get(edge):
                 total += plans[0].duration

@@ -200,11 +200,6 @@ class Edge:
         pairs = zip(self.borders, self.ratios, strict=True)
         return [border.curve.with_speed_ratio(ratio) for border, ratio in pairs]
 
-    @property
-    def signature(self) -> tuple[tuple[str, ...], ...]:
-        """Names of the contacts of each phase."""
-        return tuple(tuple(sorted(c.name for c in step.contacts)) for step in self.steps)
-
 
 class Blocked(NamedTuple):
     """An edge without a feasible motion."""

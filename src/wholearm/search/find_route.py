@@ -26,6 +26,7 @@ from .. import __version__
 from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError
 from ..common.files import make_folder, write_whole
+from ..common.parallel import pickle_deep
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..planning.options import Objective, PlanOptions
@@ -40,7 +41,6 @@ from .places import is_at, make_place, require_reach
 from .roadmap import LONGEST, Roadmap
 
 LARGEST = 200_000_000  # Most bytes of a stored roadmap
-_RECURSION = 20_000  # Depth of recursion that pickling a roadmap
 ROADMAPS = 4  # scenes whose roadmaps are kept in memory
 _roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
@@ -102,7 +102,7 @@ def find_route(
             make_folder(str(cache))
         key = describe_key(problem, plan_options)
         roadmap = get_roadmap(problem, plan_options, key, cache)
-        before, start = list[Answer](), problem.start
+        before, start, spent = list[Answer](), problem.start, 0.0
         for index, goal in enumerate(problem.goals):
             place = make_place(problem.scene, start)
             if is_at(place, goal):
@@ -115,10 +115,11 @@ def find_route(
                 RouteSearch(roadmap, place, goal),
                 plan_options,
                 jobs,
+                spent,
             )
             count = alternatives if index + 1 == len(problem.goals) else 0
             before.append(_plan_to_goal(planner, count, report, hurry))
-            start = before[-1].route.stop.z
+            start, spent = before[-1].route.stop.z, planner.estimate(before[-1].route)
         if cache is not None:
             try:
                 store_roadmap(Path(cache), key, roadmap)
@@ -240,12 +241,7 @@ def load_roadmap(folder: Path, key: str) -> Roadmap | None:
 
 def store_roadmap(folder: Path, key: str, roadmap: Roadmap) -> None:
     """Write the roadmap of a scene in place of the one before."""
-    depth = sys.getrecursionlimit()
-    sys.setrecursionlimit(max(depth, _RECURSION))
-    try:
-        body = pickle.dumps(roadmap, protocol=pickle.HIGHEST_PROTOCOL)
-    finally:
-        sys.setrecursionlimit(depth)
+    body = pickle_deep(roadmap)
     if len(body) <= LARGEST:
         digest = hashlib.sha256(body).digest()
         write_whole(_name_file(folder, key), lambda stream: stream.write(digest + body))
