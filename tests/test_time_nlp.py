@@ -18,9 +18,11 @@ from scenes import roll
 from shipped import HEPTAGON
 from timed import Sampler, drive, landing
 from wholearm import Formation, Objective, Scene, load
+from wholearm.benchmark.scenes import draw_case
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.sharing import Batch
 from wholearm.geometry.curve import Curve, tangent_basis
+from wholearm.geometry.path_guess import close_contacts, list_ends
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
 from wholearm.planning.nlp import Columns, Kernel, NlpRows, build_kernel, build_solver
@@ -41,11 +43,13 @@ from wholearm.planning.time_domain.time_nlp import (
     end_kernel,
     find_bounds,
     find_leaving,
+    find_range_end,
     impact_kernel,
     opening_kernel,
     pack,
     point_kernel,
 )
+from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
 
 
@@ -686,3 +690,18 @@ def test_the_tangent_basis_is_what_contacts_leave_free(contacts: int) -> None:
     metric = metric_weights(formation.scene)[:, None] / formation.scene.polygon.gyration_radius**2
     np.testing.assert_allclose(P @ (N / metric), 0.0, atol=1e-13)
     np.testing.assert_allclose(N.T @ (N / metric), np.eye(5 - contacts), atol=1e-13)
+
+
+def test_a_contact_is_gained_where_the_motion_ends() -> None:
+    """A pointed tip comes to a vertex along the edge, or turns onto it with its link."""
+    problem = build_problem(draw_case(1128, 412).table)
+    (phase,), start = problem.phases, problem.start
+    slip, rows = phase.formation.evaluate_slip(start[None])[0], list[int | None]()
+    for ending in list_ends(phase):
+        z = close_contacts(ending.formation, start, slip, (), ending.active)
+        assert z is not None
+        rows.append(find_range_end(phase.formation, phase.until, z))
+        gap = phase.formation.add(phase.until.contact).evaluate(z[None], z[None]).C[0, -1]
+        assert abs(gap) < 1e-9
+    assert rows == [0, None]
+    assert "runs off edge 4" in phase.formation.limits[0].text

@@ -365,7 +365,8 @@ def add_stage(
         turns, gained_softly = (), None
         N = tangent_basis(formation, guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], end[V], N.T)
-    kernel = goal_kernel(formation, until, turns, gained_softly)
+    row = None if until is None else find_range_end(formation, until, guess.nodes[-1, 0])
+    kernel = goal_kernel(formation, until, row, turns, gained_softly)
     rows.add_copies(kernel, {"z": end[Z], "v": end[V]})
     if stage.lands and until is not None and until.contact is not None:
         landing = landing_kernel(formation, until.contact)
@@ -828,20 +829,40 @@ def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
     return build_kernel(x, opening=A @ x.a + A_dot_v)
 
 
+def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
+    """Row of the limit of the range of a contact that ends near z, (5,), where another is gained.
+
+    None if that is gained by closing its gap, as a pointed tip also turns onto a vertex with the
+    side of its link: phase 1 of scene 412 of seed 1128.
+    """
+    gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    count = sum(len(build_limits(contact, formation.scene)) for contact in formation.contacts)
+    ends = [k for k in gaining if k < count]
+    values = formation.evaluate_limits(z[None])[0]
+    near = 1e-3 * formation.scene.scales.length
+    return next((k for k in ends if values[k] < near or len(gaining) == len(ends) == 1), None)
+
+
 @share
 def goal_kernel(
-    formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
+    formation: Formation,
+    until: Until | None,
+    row: int | None,
+    turns: tuple[int, ...],
+    gained: Formation | None,
 ) -> Kernel:
-    """End of a phase, zero rates of reversals, and zero speeds of contacts gained."""
+    """End of a phase, zero rates of reversals, and zero speeds of contacts gained.
+
+    `row` is as of `find_range_end`.
+    """
     scene = formation.scene
     x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
     z, v = x.z, x.v
     parts: list[Expression] = [ca.SX(0, 1)]
     if until is not None and until.contact is not None:
         # Where a contact changes its name its gap has no gradient, but the end of its range has.
-        ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
-        ends = [limit.value for limit in ranges if limit.gains(until.contact)]
-        parts.append(ends[0] if len(ends) == 1 else build_gap(until.contact, scene))
+        gap = build_gap(until.contact, scene)
+        parts.append(gap if row is None else formation.limits[row].value)
     if until is not None:
         parts += [z[row] - value for row, value in until.poses]
     if turns:
