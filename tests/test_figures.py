@@ -508,18 +508,18 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     problem, plan = problem_of(LANDING), plan_of(LANDING)
-    pushes = place_pushes(problem.scene, plan)
+    points, normals, forces = place_pushes(problem.scene, plan)
     body = problem.scene.polygon
     assert body.inertia is not None
-    arms = pushes.points - plan.q[:, None, :2]
-    moments = arms[..., 0] * pushes.forces[..., 1] - arms[..., 1] * pushes.forces[..., 0]
-    force, moment = np.nansum(pushes.forces, axis=1), np.nansum(moments, axis=1)
+    arms = points - plan.q[:, None, :2]
+    moments = arms[..., 0] * forces[..., 1] - arms[..., 1] * forces[..., 0]
+    force, moment = np.nansum(forces, axis=1), np.nansum(moments, axis=1)
     force[:, 1] -= body.mass * problem.scene.gravity
     # Newton and Euler; plans satisfy them between nodes to 1e-6 of the largest forces.
-    scale = np.nanmax(np.abs(pushes.forces))
+    scale = np.nanmax(np.abs(forces))
     np.testing.assert_allclose(body.mass * plan.q_ddot[:, :2], force, atol=1e-5 * scale)
     np.testing.assert_allclose(body.inertia * plan.q_ddot[:, 2], moment, atol=1e-6 * scale)
-    np.testing.assert_allclose(np.hypot(*pushes.normals.T), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.hypot(*normals.T), 1.0, rtol=1e-12)
 
 
 def test_a_motion_survives_its_page() -> None:

@@ -19,7 +19,7 @@ from ..problem.definition import Problem
 from ..problem.read import adopt_phases, require_phases
 from ..results.adopt import require_made_for
 from ..results.report import Report
-from ..results.torque import TorqueProfile, read_notes, read_torque_csv
+from ..results.torque import read_notes, read_torque_csv
 from ..results.trajectory import Trajectory, load_trajectory
 from ..verification.verdict import find_least_force
 from ..verification.verify import verify
@@ -140,36 +140,30 @@ def compare(
     for name, path in zip(names, paths, strict=True):
         if progress is not None:
             progress(f"replaying {name}")
-        contenders.append(_judge(name, *_read(problem, str(path))))
+        contenders.append(_judge(name, problem, str(path)))
     return Comparison(problem.name, problem.epsilon, tuple(contenders))
 
 
-def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProfile, int | None]:
-    """Torques or a trajectory that fits the problem, and how many simulations it took.
+def _judge(name: str, problem: Problem, path: str) -> Contender:
+    """The replay of a trajectory or of torques, in numbers.
 
     Goals of the problem give way to the phases that a trajectory has forces.
     """
+    planned = None
     if require_ending(path, ".npz", ".csv") == ".csv":
         noted = read_notes(path).get(SIMULATIONS)
         if noted is not None and not noted.isdecimal():
             raise InputError(path, SIMULATIONS, f"{noted!r} given; a whole number is needed")
         require_phases(problem)
-        return problem, read_torque_csv(path), None if noted is None else int(noted)
-    trajectory = load_trajectory(path)
-    problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1], path)
-    with name_source(path):
-        require_made_for(problem, trajectory.meta)
-    replay = trajectory.meta.get("replay")
-    simulations = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
-    return problem, trajectory, simulations if isinstance(simulations, int) else None
-
-
-def _judge(
-    name: str, problem: Problem, what: Trajectory | TorqueProfile, simulations: int | None
-) -> Contender:
-    """The replay of one of them, in numbers."""
-    planned = what if isinstance(what, Trajectory) else None
-    torque = what if isinstance(what, TorqueProfile) else what.torque
+        torque, simulations = read_torque_csv(path), None if noted is None else int(noted)
+    else:
+        planned = load_trajectory(path)
+        torque, meta = planned.torque, planned.meta
+        problem = adopt_phases(problem, meta, planned.q[-1], path)
+        with name_source(path):
+            require_made_for(problem, meta)
+        simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
+        simulations = simulations if isinstance(simulations, int) else None
     peaks = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
     common: dict[str, Any] = {
         "name": name,
@@ -180,7 +174,7 @@ def _judge(
         "planned": planned,
     }
     try:
-        report = verify(problem, what)
+        report = verify(problem, planned or torque)
     except (JammingError, SimulationError) as error:
         return Contender(ok=False, reason=str(error), duration=torque.duration, **common)
     forces = [(find_least_force(phase), phase.number) for phase in report.phases]

@@ -256,9 +256,11 @@ class Bench:
         phases = self.passage.phases
         of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
         best = (math.inf, phases[0].formation.names[0], 0)
-        for index in range(len(phases)):
-            rows = np.flatnonzero(of == index)
-            names = self.passage.list_pressed(index)
+        for index, after in enumerate((*phases[1:], self.passage.after)):
+            phase, rows = phases[index], np.flatnonzero(of == index)
+            # Contacts that the phase releases at its end do not count.
+            leaving = list_leaving(phase, after) if phase.until.is_release else set()
+            names = [name for name in phase.formation.names if name not in leaving]
             columns = [contacts.index(name) for name in names]
             c_n = np.nan_to_num(forces[rows][:, columns], nan=math.inf)
             if c_n.min(initial=math.inf) < best[0]:
@@ -290,12 +292,6 @@ class Passage:
     def until(self) -> Until:
         """What ends it."""
         return self.phases[-1].until
-
-    def list_pressed(self, index: int) -> list[str]:
-        """The contacts of a phase that press to its end: without those that it releases."""
-        phase, after = self.phases[index], (*self.phases[1:], self.after)[index]
-        leaving = list_leaving(phase, after) if phase.until.is_release else set()
-        return [name for name in phase.formation.names if name not in leaving]
 
     def follow(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
         """When its phases end [s], as far as they do, and the first loss of a contact before.

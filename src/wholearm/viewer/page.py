@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from html import escape
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -62,19 +62,16 @@ def _embed(value: dict[str, Any]) -> str:
     return f'<script type="application/json">{text}</script>'
 
 
-class Pushes(NamedTuple):
-    """Where contacts are, and what they do to the object."""
-
-    points: Array  # (n, m, 2) [m]
-    normals: Array  # (n, m, 2): into the object
-    # (n, m, 2) [N]: c_n n + c_t t; NaN where a contact is not in the formation, or no force is
-    # known
-    forces: Array
-
-
 @exclusive
-def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
-    """Contacts and their forces at the samples of a trajectory."""
+def place_pushes(scene: Scene, trajectory: Trajectory) -> tuple[Array, Array, Array]:
+    """Contacts and their forces at the n samples of a trajectory.
+
+    Returns
+    -------
+    points : (n, m, 2) [m]
+    normals : (n, m, 2)     into the object
+    forces : (n, m, 2) [N]  c_n n + c_t t; NaN where a contact has none, or none is known
+    """
     places = [build_geometry(parse_contact(name, scene), scene) for name in trajectory.contacts]
     rows = [ca.vertcat(place.point, place.normal) for place in places]
     evaluate = ca.Function("places", [build_features(scene).z], [ca.vertcat(*rows)])
@@ -82,7 +79,7 @@ def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
     points, normals = values[..., :2], values[..., 2:]
     tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1)
     forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
-    return Pushes(points, normals, forces)
+    return points, normals, forces
 
 
 def describe_motion(
@@ -96,7 +93,7 @@ def describe_motion(
     ghost    another motion of the same hand, drawn behind: a replay
     most     about as many samples are taken at most
     """
-    scene, pushes = problem.scene, place_pushes(problem.scene, trajectory)
+    scene, (points, normals, _) = problem.scene, place_pushes(problem.scene, trajectory)
     styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)
     contacts = list[dict[str, Any]]()
@@ -106,8 +103,8 @@ def describe_motion(
         spans = [
             {
                 "first": run.start,
-                "point": _fix(pushes.points[rows[run], index], scene),
-                "normal": _fix(pushes.normals[rows[run], index], scene),
+                "point": _fix(points[rows[run], index], scene),
+                "normal": _fix(normals[rows[run], index], scene),
                 "c": _round(c[run]),
             }
             for run in find_runs(np.isfinite(c).all(axis=1), least=2)
