@@ -15,13 +15,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ..figures.style import PALETTE, open_figure
+from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
 from .scenes import name_first
-from .study import Case, Row, Study, finish_axes, format_table
+from .study import Case, Row, Study, format_table
 
 SIZES = {
     "intervals": (50, 100, 200, 400, 800, 1600, 3200),
@@ -89,7 +89,8 @@ class Growth(Study):
                         axis.set_minor_formatter(NullFormatter())
                     axes.set_xlabel(f"{grows} [-]")
                     axes.set_ylabel(label)
-                    finish_axes(axes, fontsize=8)
+                    axes.grid(True, which="major", color=GRID, linewidth=0.6)
+                    axes.legend(fontsize=8)
         return figure
 
 

@@ -37,7 +37,7 @@ from ..common.arrays import Array, Expression
 from ..common.errors import InputError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..figures.style import PALETTE, open_figure
+from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, build_forward, inverse
@@ -57,7 +57,7 @@ from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
-from .study import Case, Row, Study, finish_axes, format_table
+from .study import Case, Row, Study, format_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -847,7 +847,8 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
     axes.set_xlabel(f"{what}, median over phases [-]")
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
     if axes.lines:
-        finish_axes(axes, fontsize=8, ncols=2)
+        axes.grid(True, which="major", color=GRID, linewidth=0.6)
+        axes.legend(fontsize=8, ncols=2)
 
 
 class Precision(Study):

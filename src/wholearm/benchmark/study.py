@@ -32,7 +32,6 @@ from ..common.journal import Journal
 from ..common.parallel import Processes, run_all
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Case = tuple[Any, ...]  # plain values that say what is run: the name of its record, too
@@ -213,12 +212,6 @@ def format_table(
     cells = [heads, *rows]
     lines = [f"| {' | '.join(map(str, row))} |" for row in cells]
     return [lines[0], f"|{'|'.join(marks)}|", *lines[1:]]
-
-
-def finish_axes(axes: Axes, **legend: Any) -> None:
-    """Give axes a grid and a legend."""
-    axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
-    axes.legend(**legend)
 
 
 def digest_source(inputs: Iterable[Path] = ()) -> str:

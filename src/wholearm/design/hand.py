@@ -52,9 +52,7 @@ class Choice(NamedTuple):
         return float(f"{min(max(value, self.low), self.high):.6g}")
 
 
-def read_choices(
-    problem: Problem, texts: Sequence[str], symmetric: bool = False, label: str = "--over"
-) -> list[Choice]:
+def read_choices(problem: Problem, texts: Sequence[str], symmetric: bool = False) -> list[Choice]:
     """Numbers and their ranges from texts ``NAME=LOW:HIGH``.
 
     In a symmetric hand what is said of one finger holds for the other, mirrored at x = 0.
@@ -70,18 +68,18 @@ def read_choices(
         try:
             low, high = map(float, numbers.split(":"))
         except ValueError:
-            raise InputError("", label, f"{text!r} given; NAME=LOW:HIGH is needed") from None
-        parameter = find_parameter(problem, name, label)
+            raise InputError("", "--over", f"{text!r} given; NAME=LOW:HIGH is needed") from None
+        parameter = find_parameter(problem, name, "--over")
         if not -math.inf < low < high < math.inf:
-            raise InputError("", f"{label} {name}", f"{numbers} given; LOW has to be below HIGH")
+            raise InputError("", f"--over {name}", f"{numbers} given; LOW has to be below HIGH")
         for end in (low, high):
-            require_allowed(problem, parameter, end, label)
+            require_allowed(problem, parameter, end, "--over")
         factors = dict.fromkeys(parameter.keys, 1.0)
         for key in parameter.keys if symmetric else ():
             other = re.sub(r"(finger(?:s\.)?)([12])", lambda m: m[1] + "21"[int(m[2]) - 1], key)
             factors.setdefault(other, -1.0 if key.endswith("base[1]") else 1.0)
         if taken & {*factors}:
-            raise InputError("", f"{label} {name}", "is chosen by what stands before, too")
+            raise InputError("", f"--over {name}", "is chosen by what stands before, too")
         taken |= {*factors}
         choices.append(Choice(parameter, low, high, factors))
     return choices

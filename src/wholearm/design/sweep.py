@@ -260,13 +260,6 @@ def name_parameter(problem: Problem, name: str, values: Sequence[Any]) -> str:
     return name
 
 
-def describe_progress(done: int, count: int, before: int, began: float) -> str:
-    """A bar of what is done, and the time that is left at the speed since `began` [s]."""
-    left = (time.monotonic() - began) / max(done - before, 1) * (count - done)
-    time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
-    return f"[{'#' * (20 * done // count):.<20}] {done} of {count} points, {time_left} left"
-
-
 def sweep(
     problems: Problem | Sequence[Problem],
     vary: Mapping[str, Sequence[Any]],
@@ -347,7 +340,11 @@ def sweep(
                 rows[number] = answer
                 journal.add({"point": number, "row": answer})
             if progress is not None:
-                progress(describe_progress(len(rows), len(points), before, began))
+                done, count = len(rows), len(points)
+                left = (time.monotonic() - began) / max(done - before, 1) * (count - done)
+                time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
+                bar = f"[{'#' * (20 * done // count):.<20}]"
+                progress(f"{bar} {done} of {count} points, {time_left} left")
     whole = (
         {"problem": names[index], **dict(zip(axes, values, strict=True)), **rows[k]}
         for k, (index, *values) in enumerate(points)
