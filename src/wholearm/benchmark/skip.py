@@ -25,7 +25,7 @@ from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
 from .study import Case, Row, Study, format_table
 
-COLUMNS = ("unknowns", "rows", "building", "solving")
+COLUMNS = {"unknowns": "", "rows": "", "building": " [ms]", "solving": " [ms]"}  # with units
 
 
 class Skip(Study):
@@ -59,9 +59,8 @@ class Skip(Study):
                 group = [row for row in rows if row["case"][1:3] == [part, having]]
                 cells.append(f"{median(row[column] for row in group):.0f}")
             table.append(cells)
-        firsts = ("unknowns", "rows", "building without [ms]", "solving without [ms]")
-        heads = [f"{name} without" if name in COLUMNS else name for name in firsts]
-        lines += format_table(["part", *(h for head in heads for h in (head, "with"))], table)
+        firsts = (f"{name} without{unit}" for name, unit in COLUMNS.items())
+        lines += format_table(["part", *(h for first in firsts for h in (first, "with"))], table)
         return "\n".join(lines), []
 
 
