@@ -114,10 +114,10 @@ class Queries(Study):
         if solved:
             heads = ["", "carried out", "objective off: median", "most", "time: median", "95 %"]
             lines += ["", *format_table(heads, filter(None, (_sum_up(w, solved) for w in WAYS)))]
+        tried = [(row, way, part) for row in rows for way, part in row.get("ways", {}).items()]
+        if refusals := [(row, way, part["why"]) for row, way, part in tried if part.get("why")]:
             lines += ["", "Refused:", ""]
-        for row in rows:
-            parts = row.get("ways", {}).items()
-            lines += [f"* {row['text']}, {w}: {p['why'][:300]}" for w, p in parts if p.get("why")]
+            lines += [f"* {row['text']}, {way}: {why[:300]}" for row, way, why in refusals]
         wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
