@@ -102,34 +102,16 @@ TUNED = {
 SEED = 0
 
 
-def list_cases() -> Iterator[Case]:
-    """All cases: first those that take long, so that processes end together."""
-    yield from (("tune", name) for name in reversed(TUNED))
-    yield from (("plan over time", *pair) for pair in product(PROBLEMS, OBJECTIVES))
-    yield from (("policy", name) for name in PROBLEMS)
-    yield from (("plan", *pair) for pair in product(PROBLEMS, OBJECTIVES))
-    yield from (("variant", name) for name in VARIANTS)
-    yield from (("goal", k) for k in range(60))
-    yield "robustness", "heptagon_four_contacts"
-    yield from (("scene", k, OBJECTIVES[k % 3]) for k in range(60))
-    yield from (("leg", k, OBJECTIVES[k % 3]) for k in range(60))
-    yield from (("free", name) for name in PROBLEMS)
-    yield from (("torques", name, share) for name in TUNED for share in (1.0, 1.05, 0.9))
-    yield from (("compare", "heptagon_four_contacts"), ("report", "heptagon_four_contacts"))
-    yield from (("predict", name) for name in PROBLEMS)
-    yield from (("map", name) for name in PROBLEMS)
-    yield from (("counts", name) for name in PROBLEMS)
-    yield from (("list", k) for k in range(20))
-    yield from (("input", k) for k in range(120))
-    yield from (("option", name) for name in OPTIONS)
-    yield from (("torque file", k) for k in range(10))
+def list_cases() -> list[Case]:
+    """All cases."""
+    return [(family, *each) for family, (_, cases) in FAMILIES.items() for each in cases]
 
 
 def answer(case: Case, folder: Path) -> Row:
     """What the package says to a case, or why it refuses; `folder` has the shipped problems."""
     family, *arguments = case
     try:
-        row = FAMILIES[family](folder, *arguments)
+        row = FAMILIES[family][0](folder, *arguments)
     except wholearm.WholearmError as error:
         row = _refuse(error)
     return dict(_shorten(row))
@@ -550,28 +532,30 @@ def _read_torques(folder: Path, number: int) -> Row:
         return {"change": change} | _try(path, verify)
 
 
-FAMILIES: dict[str, Callable[..., Row]] = {
-    "plan": _plan,
-    "plan over time": partial(_plan, transcription="time"),
-    "variant": _vary,
-    "goal": _reach,
-    "scene": _scene,
-    "leg": _leg,
-    "free": _simulate_free,
-    "torques": _follow,
-    "tune": _tune,
-    "predict": _predict,
-    "policy": _control,
-    "robustness": _assess,
-    "compare": _compare,
-    "report": _report,
-    "map": _draw_map,
-    "counts": lambda folder, name: count(_load(folder, name)),
-    "list": _list,
-    "input": _read,
-    "option": _ask,
-    "torque file": _read_torques,
+FAMILIES: dict[str, tuple[Callable[..., Row], list[Case]]] = {
+    "tune": (_tune, [*zip(reversed(TUNED))]),
+    "plan over time": (partial(_plan, transcription="time"), [*product(PROBLEMS, OBJECTIVES)]),
+    "policy": (_control, [*zip(PROBLEMS)]),
+    "plan": (_plan, [*product(PROBLEMS, OBJECTIVES)]),
+    "variant": (_vary, [*zip(VARIANTS)]),
+    "goal": (_reach, [*zip(range(60))]),
+    "robustness": (_assess, [("heptagon_four_contacts",)]),
+    "scene": (_scene, [(k, OBJECTIVES[k % 3]) for k in range(60)]),
+    "leg": (_leg, [(k, OBJECTIVES[k % 3]) for k in range(60)]),
+    "free": (_simulate_free, [*zip(PROBLEMS)]),
+    "torques": (_follow, [*product(TUNED, (1.0, 1.05, 0.9))]),
+    "compare": (_compare, [("heptagon_four_contacts",)]),
+    "report": (_report, [("heptagon_four_contacts",)]),
+    "predict": (_predict, [*zip(PROBLEMS)]),
+    "map": (_draw_map, [*zip(PROBLEMS)]),
+    "counts": (lambda folder, name: count(_load(folder, name)), [*zip(PROBLEMS)]),
+    "list": (_list, [*zip(range(20))]),
+    "input": (_read, [*zip(range(120))]),
+    "option": (_ask, [*zip(OPTIONS)]),
+    "torque file": (_read_torques, [*zip(range(10))]),
 }
+"""What families ask, and with which arguments; first those that take long, so that processes end
+together."""
 
 
 TOLERANCES = {
