@@ -23,17 +23,12 @@ from ..problem.read import build_problem, read_problem
 from .scenes import name_first
 from .study import Case, Row, Study, format_table
 
-SIZES = {
-    "intervals": (50, 100, 200, 400, 800, 1600, 3200),
-    "phases": (3, 6, 12, 25, 50),
-    "vertices": (6, 12, 25, 50, 100),
-}
 WORK = {
-    "intervals": ("least time", "margin"),
-    "phases": ("least time",),
-    "vertices": ("reading", "map"),
+    "intervals": (("least time", "margin"), (50, 100, 200, 400, 800, 1600, 3200)),
+    "phases": (("least time",), (3, 6, 12, 25, 50)),
+    "vertices": (("reading", "map"), (6, 12, 25, 50, 100)),
 }
-"""Kinds of work that are measured for each."""
+"""What grows, kinds of work that are measured, and sizes."""
 FIELDS = {"seconds": ("s", "processor time [s]"), "memory": ("MB", "rise of memory [MB]")}
 """Quantities that are measured, their units and labels."""
 
@@ -49,8 +44,8 @@ class Growth(Study):
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """What grows, what is done, and the size."""
         load(options.problem)
-        for grows, sizes in SIZES.items():
-            yield from product([options.problem], [grows], WORK[grows], sizes)
+        for grows, (works, sizes) in WORK.items():
+            yield from product([options.problem], [grows], works, sizes)
 
     def run(self, case: Case) -> Row:
         """Do one piece of work."""
@@ -61,10 +56,10 @@ class Growth(Study):
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables with the exponents."""
         lines = ["Processor time and rise of the peak memory, each in a process of its own.", ""]
-        for grows, sizes in SIZES.items():
+        for grows, (works, sizes) in WORK.items():
             lines += [f"## {grows.capitalize()}", ""]
             table = []
-            for work, (field, (unit, _)) in product(WORK[grows], FIELDS.items()):
+            for work, (field, (unit, _)) in product(works, FIELDS.items()):
                 measured_sizes, values = select(rows, grows, work, field)
                 shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
                 exponent = fit_exponent(measured_sizes, values)
@@ -75,14 +70,14 @@ class Growth(Study):
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Cost above, memory below, over what grows, on logarithmic axes."""
         with open_figure(10.0, 6.4, layout="constrained") as figure:
-            grid = figure.subplots(2, len(SIZES), squeeze=False)
-            for column, grows in zip(grid.T, SIZES, strict=True):
+            grid = figure.subplots(2, len(WORK), squeeze=False)
+            for column, (grows, (works, ticks)) in zip(grid.T, WORK.items(), strict=True):
                 for axes, (field, (_, label)) in zip(column, FIELDS.items(), strict=True):
-                    for work, colour, marker in zip(WORK[grows], PALETTE, "os", strict=False):
+                    for work, colour, marker in zip(works, PALETTE, "os", strict=False):
                         sizes, values = select(rows, grows, work, field)
                         name = f"{work}, exponent {fit_exponent(sizes, values):.2f}"
                         axes.loglog(sizes, values, color=colour, marker=marker, label=name)
-                    axes.set_xticks(SIZES[grows], map(str, SIZES[grows]))
+                    axes.set_xticks(ticks, map(str, ticks))
                     low, high = (np.log10(limit) for limit in axes.get_ylim())
                     axes.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
                     for axis in (axes.xaxis, axes.yaxis):
