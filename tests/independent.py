@@ -42,88 +42,50 @@ def balances(touching: Formation, z: Array, tau: Array, least: float = 0.0) -> b
 
 
 class Collision(NamedTuple):
-    """Velocity after an impact, and what each contact does.
+    """Velocity after an impact, and what each contact does."""
 
-    Attributes
-    ----------
-    v : ndarray, shape (5,)
-    rates, slips : ndarray, shape (n_c,), [m/s]
-        How fast contacts part and slide.
-    normal, tangential : ndarray, shape (n_c,), [N s]
-    """
-
-    v: Array
-    rates: Array
+    v: Array  # (5,)
+    rates: Array  # rates, slips (n_c,) [m/s]: how fast contacts part and slide
     slips: Array
-    normal: Array
+    normal: Array  # normal, tangential (n_c,) [N s]: impulses
     tangential: Array
 
 
-def collide(formation: Formation, z: Array, v: Array, sweeps: int = 20_000) -> Collision:
-    """Contacts press or part, slide or stick, each on its own terms, until all agree.
+def collide(formation: Formation, z: Array, v: Array) -> Collision:
+    """Impact of all that touch, vertex contacts, which press or part, slide or stick.
 
-    At every contact 0 <= p_n, 0 <= u_n, p_n u_n = 0 and Coulomb's law between p_t and u_t, by
-    nonlinear Gauss-Seidel sweeps. Nothing is assumed about which contacts press or which way they
-    slide.
-
-    Parameters
-    ----------
-    formation : Formation
-        Of vertex contacts, all that touch.
-    z, v : ndarray, shape (5,)
-        Configuration, and velocity before.
+    At every contact 0 <= p_n, 0 <= u_n, p_n u_n = 0 and Coulomb's law between p_t and u_t. Nothing
+    is assumed about which contacts press or which way they slide.
     """
-    scene, body = formation.scene, formation.scene.polygon
-    assert body.inertia is not None
-    mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
-    N, T = stack_rows(formation, z)
-    count, v = len(N), v.copy()
-    p = np.zeros((2, count))
-    rows = np.stack([N, T])
-    lifts = rows / mass
-    weights = (rows * lifts).sum(axis=2)
-    for _ in range(sweeps):
-        before = v.copy()
-        for k in range(count):
-            for axis in range(2):
-                wanted = p[axis, k] - rows[axis, k] @ v / weights[axis, k]
-                bound = formation.friction[k] * p[0, k]
-                new = max(0.0, wanted) if axis == 0 else min(max(wanted, -bound), bound)
-                v += lifts[axis, k] * (new - p[axis, k])
-                p[axis, k] = new
-        if np.abs(v - before).max() < 1e-15:
-            break
-    return Collision(v, N @ v, T @ v, p[0], p[1])
+    mass, (N, T) = formation.scene.mass_diagonal, stack_rows(formation, z)
+    rows = np.vstack([N, T, np.eye(5)[3:]])
+    # Joints take no impulse.
+    none = np.zeros(len(rows))
+    p = _solve((rows / mass) @ rows.T, rows @ v, formation.friction, none[:2], none)
+    after = v + rows.T @ p / mass
+    return Collision(after, N @ after, T @ after, *np.split(p[:-2], 2))
 
 
 def march(
-    formation: Formation, z: Array, v: Array, torque: Callable[[float], Array], stop: float, n: int
+    formation: Formation, z: Array, v: Array, torque: TorqueProfile, stop: float, n: int
 ) -> tuple[Array, Array]:
     """States after each of n equal steps from time 0, shape (n, 5) each.
 
-    Parameters
-    ----------
-    formation : Formation
-        Of vertex contacts, all that touch; whether they roll or slide is not looked at.
+    All that touch are vertex contacts; whether they roll or slide is not looked at.
     """
-    scene = formation.scene
-    body, links = scene.polygon, scene.fingers
-    assert body.inertia is not None
-    mass = np.array([body.mass, body.mass, body.inertia, *(link.inertia for link in links)])
-    drag = np.array([0.0, 0.0, 0.0, *(link.viscous for link in links)])
-    dry = np.array([link.dry for link in links])
-    weight = np.array([0.0, -body.mass * scene.gravity, 0.0, 0.0, 0.0])
-    h = stop / n
+    scene, h = formation.scene, stop / n
+    mass = scene.mass_diagonal
     p = np.zeros(2 * formation.n_contacts + 2)
     states = []
-    for k in range(n):
+    instants = np.asarray((np.arange(n) + 0.5) * h, dtype=np.float64)
+    for tau in torque.at(instants):
         middle = z + h / 2 * v
         N, T = stack_rows(formation, middle)
         rows = np.vstack([N, T, np.eye(5)[3:]])
-        push = weight - drag * v
-        push[3:] += torque((k + 0.5) * h)
+        push = scene.applied_force - scene.viscous * v
+        push[3:] += tau
         free = v + h * push / mass
-        p = _solve((rows / mass) @ rows.T, rows @ free, formation.friction, h * dry, p)
+        p = _solve((rows / mass) @ rows.T, rows @ free, formation.friction, h * scene.dry[3:], p)
         v = free + rows.T @ p / mass
         z = middle + h / 2 * v
         states.append(np.concatenate([z, v]))
@@ -181,12 +143,7 @@ def integrate_phase(
 ) -> Integrated:
     """Integrate a phase until `span` ends or the first c_n falls to zero, directions as they are.
 
-    Parameters
-    ----------
-    state : ndarray, shape (10,)
-        At the start of `span`.
-    accuracy : float
-        Relative and absolute, of each step.
+    `state` is (z, z') at its start, and `accuracy` relative and absolute for each step.
     """
     contacts, own = problem.phases[index].formation.contacts, torque
 

@@ -32,6 +32,12 @@ def rotate(angle: ArrayLike, points: ArrayLike) -> Array:
     return turned
 
 
+def find_null_vector(rows: Array) -> Array:
+    """Null vector of rows, shape (4, 5), by their signed minors."""
+    minors = [(-1) ** k * np.linalg.det(np.delete(rows, k, axis=1)) for k in range(5)]
+    return np.array(minors)
+
+
 def dot(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])
 
@@ -69,6 +75,15 @@ def finger_gap(scene: Scene, q: Array, finger: int, angles: ArrayLike) -> Array:
     corners = np.broadcast_to(corners, (len(tips), *corners.shape[-2:]))
     bones = np.stack(np.broadcast_arrays(np.asarray(link.base), tips), axis=1)
     return separate(corners, bones) - link.radius
+
+
+def is_first_touch(
+    scene: Scene, q: Array, finger: int, angle: float, close: float = 1e-14, count: int = 1500
+) -> bool:
+    """Whether a link that closes from pointing down, outside, touches the object there at last."""
+    first = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
+    *before, last = finger_gap(scene, q, finger, np.linspace(first, angle, count))
+    return bool(abs(last) < close and min(before) > 0)
 
 
 def convex_polygon(rng: np.random.Generator, count: int, size: float = 0.05) -> Array:
@@ -119,8 +134,9 @@ def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
     right, left = (
         replace(link, speed_limit=limit) for link, limit in zip(scene.fingers, limits, strict=True)
     )
-    slow = Scene(scene.polygon, (right, left), scene.friction, scene.gravity)
-    return replace(curve, formation=Formation(slow, curve.formation.contacts))
+    return replace(
+        curve, formation=replace(curve.formation, scene=replace(scene, fingers=(right, left)))
+    )
 
 
 def locate_all(formation: Formation, z: Array) -> list[Touch]:
@@ -159,16 +175,11 @@ def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, 
     Forces x and y and the moment of the object, then the moments of the joints, at one instant or
     at many along the first axis; `sigma` has the directions of the joints, shape (..., 2).
     """
-    scene = formation.scene
-    body = scene.polygon
-    assert body.inertia is not None
-    masses = [body.mass, body.mass, body.inertia, *(link.inertia for link in scene.fingers)]
-    weight, joints, drag = (np.zeros_like(row.z) for _ in range(3))
-    weight[..., 1] = -body.mass * scene.gravity
-    joints[..., 3:] = row.tau
-    for k, link in enumerate(scene.fingers):
-        drag[..., 3 + k] = -link.viscous * row.z_dot[..., 3 + k] - link.dry * sigma[..., k]
-    terms = [weight, -np.array(masses) * row.z_ddot, joints, drag]
+    scene, joints, dry = formation.scene, np.zeros_like(row.z), np.zeros_like(row.z)
+    joints[..., 3:], dry[..., 3:] = row.tau, sigma
+    weight = np.broadcast_to(scene.applied_force, row.z.shape)
+    drag = -scene.viscous * row.z_dot - scene.dry * dry
+    terms = [weight, -scene.mass_diagonal * row.z_ddot, joints, drag]
     A, A_t = stack_rows(formation, row.z)
     pushes = [row.c_n[..., None] * A, row.c_t[..., None] * A_t]
     every = np.concatenate([np.stack(terms, axis=-2), *pushes], axis=-2)

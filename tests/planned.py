@@ -122,19 +122,10 @@ class DepartingMotion(CosineMotion):
 
 @dataclass(frozen=True, eq=False)
 class LandingMotion:
-    """Three contacts on the way from a place (x, phi) at a speed to another one, to rest there.
+    """Three contacts on the way from `start` and `start_dot`, (5,), to rest at (x, phi).
 
-    phi is a cubic in time, and x one in phi, so that the direction of travel can be chosen.
-
-    Attributes
-    ----------
-    formation : Formation
-    start, start_dot : ndarray, shape (5,)
-    x, phi : float, [m] and [rad]
-        The end.
-    slope : float, [m/rad]
-        dx/dphi there.
-    duration : float, [s]
+    phi is a cubic in time, and x one in phi, so that the direction of travel can be chosen: `slope`
+    is dx/dphi at the end [m/rad].
     """
 
     formation: Formation
@@ -262,7 +253,7 @@ def plan(
         CosineMotion(curve, duration, choose_squeeze(curve, duration, least, 2.0))
         for curve in trace_phases(problem)
     ]
-    torque = join([motion.fit(pieces, degree) for motion in motions])
+    torque = TorqueProfile.chain([motion.fit(pieces, degree) for motion in motions])
     return problem, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
 
 
@@ -288,20 +279,9 @@ def plan_landing(duration: float = 0.2, squeeze: float = 12.0) -> tuple[Problem,
         Phase(1, formation, Until(contact=parse_contact("v2-palm", scene))),
     )
     motions: tuple[DepartingMotion, LandingMotion] = (departing, landing)
-    torque = join([motion.fit(60, 7) for motion in motions])
+    torque = TorqueProfile.chain([motion.fit(60, 7) for motion in motions])
     one = dataclasses.replace(problem, start=curve.start, phases=phases)
     return one, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
-
-
-def join(profiles: list[TorqueProfile]) -> TorqueProfile:
-    """One profile after the other."""
-    breaks, start = [np.zeros(1)], 0.0
-    for profile in profiles:
-        breaks.append(start + profile.breaks[1:])
-        start = float(breaks[-1][-1])
-    return TorqueProfile(
-        np.concatenate(breaks), np.concatenate([profile.coefficients for profile in profiles])
-    )
 
 
 def change(profile: TorqueProfile, edit: Callable[[Array, Array], Array]) -> TorqueProfile:

@@ -19,25 +19,6 @@ FAR = Until(coordinate="x", value=-0.3)
 """An end that is never reached."""
 
 
-def linear(
-    times: Sequence[float] | Array, first: Sequence[float] | Array, second: Sequence[float]
-) -> TorqueProfile:
-    """Torques linear between instants [s, N m]; a time given twice is a step."""
-    t, tau = np.array(times), np.array([first, second]).T
-    pieces = np.flatnonzero(np.diff(t) > 0)
-    middle, half = (tau[1:] + tau[:-1])[pieces] / 2, (tau[1:] - tau[:-1])[pieces] / 2
-    breaks = np.append(t[pieces], t[-1])
-    return TorqueProfile(breaks, np.stack([middle, half], axis=2))
-
-
-def evaluate(torque: TorqueProfile, t: float) -> Array:
-    """Torques at one instant, shape (2,)."""
-    k = min(int(np.searchsorted(torque.breaks, t, side="right")) - 1, len(torque.coefficients) - 1)
-    start, stop = torque.breaks[k : k + 2]
-    x = (2 * t - start - stop) / (stop - start)
-    return np.asarray(torque.coefficients[k] @ x ** np.arange(torque.coefficients.shape[2]))
-
-
 @cache
 def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Problem:
     """A box on the palm that finger 1 leans on, and finger 2 far off; both slide freely.
@@ -56,7 +37,8 @@ def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Pro
 def rocking(scale: float = 1.0) -> TorqueProfile:
     """Finger 1 pushes the box until it slides, eases off until it sticks, and does so again."""
     share = np.array([0.0, 1.4, 1.3, 0.35, 0.35, 1.5, 0.4])
-    return linear(np.arange(7) / 10, 0.14 * scale * share, [1e-3] * 7)
+    tau = np.column_stack([0.14 * scale * share, np.full(7, 1e-3)])
+    return TorqueProfile.join_rows(np.arange(7) / 10, tau)
 
 
 def fit_stages(torque: Callable[[float, int], Array], times: Sequence[float]) -> TorqueProfile:
@@ -133,18 +115,8 @@ class Roll:
 
     Vertex 1 is on the palm, and both links touch; phi falls from rest. The torques follow by
     inverse dynamics: three normal forces and two torques from five equations, where the vertex has
-    `share` of what friction could give as it rolls.
-
-    Attributes
-    ----------
-    formation : Formation
-        Vertex 1 on the palm, then a vertex on each link.
-    start : ndarray, shape (5,)
-    share : float
-    run : float, [m]
-        How far it slides each time.
-    times : tuple of float, [s]
-        When it starts, rolls, slides again and ends.
+    `share` of what friction could give as it rolls. It slides by `run` each time [m], and starts,
+    rolls, slides again and ends at `times` [s].
     """
 
     formation: Formation

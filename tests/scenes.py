@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from functools import cache, lru_cache
 
@@ -22,7 +21,6 @@ from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
-from wholearm.problem.read import build_problem
 
 
 @cache
@@ -30,11 +28,8 @@ def hexagon(
     lengths: tuple[float, float] = (0.18, 0.18), base: float = -0.08, solid: bool = True
 ) -> Problem:
     """The hexagon's problem; with links of equal length they touch halfway through the slide."""
-    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
-    for key, length in zip("12", lengths, strict=True):
-        table["fingers"][key]["length"] = length
-    table["fingers"]["2"]["base"][0] = base
-    return build_problem(table | {"fingers_collide": solid})
+    changes = {"length1": lengths[0], "length2": lengths[1], "fingers.2.base[1]": base}
+    return problem_of(HEXAGON).with_(changes | {"fingers_collide": solid})
 
 
 @once
@@ -54,13 +49,9 @@ def shorten(problem: Problem) -> Problem:
 @cache
 def make_way(solid: bool) -> Problem:
     """Finger 2 pushes the hexagon below a free finger 1, which has to make way for the other."""
-    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
-    for finger in table["fingers"].values():
-        finger["length"] = 0.19
-    table["fingers"]["2"]["base"][0] = -0.085
-    table["start"]["x"] = -0.03
     push = {"contacts": ["v0-palm", "v1-palm", "v5-finger2"], "until": {"x": 0.0}}
-    return build_problem(table | {"fingers_collide": solid, "phases": [push]})
+    changes = {"length": 0.19, "fingers.2.base[1]": -0.085, "x": -0.03, "phases": [push]}
+    return problem_of(HEXAGON).with_(changes | {"fingers_collide": solid})
 
 
 def place_links(scene: Scene, z: Array) -> list[Array]:
@@ -133,17 +124,6 @@ def raised(stop: float = 0.5) -> Problem:
     start = _close(scene, _tip(scene, 0.3), 0.0)
     phase = Phase(0, Formation(scene, find_touching(scene, start)), Until(None, "phi", stop))
     return Problem("raise", scene, 0.05, start, (phase,))
-
-
-@cache
-def parting() -> Problem:
-    """Finger 1 pushes a box over the palm that finger 2 touches as well at the start."""
-    corners = [[-0.045, -0.03], [0.045, -0.03], [0.045, 0.09], [-0.045, 0.09]]
-    scene = make_scene(corners, base=0.1)
-    start = _close(scene, place_flush(scene, 0, 0.0), 0.0)
-    formation = Formation(scene, find_touching(scene, start)[:3])
-    phase = Phase(0, formation, Until(None, "x", -0.015))
-    return Problem("part", scene, 0.05, start, (phase,))
 
 
 def _with_palm(fingers: float, palm: float) -> Scene:
@@ -236,12 +216,7 @@ def roll(formation: Formation, *names: str) -> Formation:
 def falling(mu: float, lean: float) -> Problem:
     """A box that falls over vertex 1, with both fingers far away and without friction.
 
-    Parameters
-    ----------
-    mu : float
-        Friction with the palm.
-    lean : float, [rad]
-        Of the line from vertex 1 to the centroid, to the right of upright, at the start.
+    At first the line from vertex 1 to the centroid leans by `lean` [rad] to the right of upright.
     """
     scene = make_scene(POINTS, base=0.4)
     free = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]

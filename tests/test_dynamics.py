@@ -13,6 +13,7 @@ from independent import balances, collide
 from plane import (
     SQUARE,
     cross,
+    find_null_vector,
     make_formation,
     make_scene,
     measure_gaps,
@@ -33,7 +34,7 @@ from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse, reduced_inertia
+from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse, reduced_inertia
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
 from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
@@ -45,10 +46,6 @@ from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.complementarity import (
-    APART,
-    BACK,
-    FORTH,
-    STICKS,
     ContactAnswer,
     ContactProblem,
     list_answers,
@@ -58,75 +55,84 @@ from wholearm.simulation.complementarity import (
 from wholearm.verification.verdict import find_wedged
 from wholearm.verification.verify import reduce_to_first_joint
 
+State = tuple[Formation, Array, Array, Directions]
+"""A formation, a configuration and a velocity that keep its contacts, and the signs of sliding."""
 
-def states(curves: tuple[Curve, ...], count: int = 4) -> Iterator[tuple[Curve, float, Directions]]:
-    """Random places of every segment of every curve, with the signs of motion along +s."""
+
+def sliding_states(curves: tuple[Curve, ...], count: int = 4) -> Iterator[State]:
+    """Random places of every segment of every curve, at a speed along it."""
     rng = np.random.default_rng(11)
     for curve in curves:
         for segment in curve.segments:
             for part in rng.uniform(0.02, 0.98, count):
                 s = segment.start + part * (segment.stop - segment.start)
-                yield curve, s, Directions(segment.Xi, segment.sigma)
+                point = curve.evaluate(np.array([s]))
+                v = rng.uniform(0.1, 0.5) * point.z_s[0]
+                yield curve.formation, point.z[0], v, Directions(segment.Xi, segment.sigma)
 
 
-def random_motion(rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Path acceleration, squared speed and squeeze, as arrays of one place."""
-    return rng.uniform(-2, 2, 1), rng.uniform(0.01, 0.2, 1), rng.uniform(1, 5, 1)
+def every_state(curves: tuple[Curve, ...]) -> Iterator[State]:
+    """Those, and some of a curve's contacts, one of which may roll, with a velocity left free."""
+    yield from sliding_states(curves)
+    for whole, z, _, _ in sliding_states(curves, 1):
+        scene, every = whole.scene, whole.contacts
+        fewer = [Formation(scene, every[:count]) for count in (1, 2, 3)]
+        for kept, rolls in (((1, 2, 3), 1), ((0, 2, 3), 2), ((1, 2, 3), 3)):
+            fewer.append(Formation(scene, tuple(every[k] for k in kept), (every[rolls],)))
+        for formation in fewer:
+            kinematics = formation.evaluate(z[None], z[None])
+            v = 0.3 * np.linalg.svd(kinematics.P[0])[2][-1]
+            slip = kinematics.A_t[0] @ v
+            directions = Directions(np.sign(slip), np.sign(v[3:]))
+            if np.abs(np.delete(slip, formation.rolling_rows)).min() < 1e-9:
+                continue  # The other vertex of a flush edge does not slide either: it has no sign.
+            one_freedom = formation.n_constraints == 4
+            if one_freedom and abs(reduced_inertia(formation, kinematics, directions)[0]) <= 0.05:
+                continue
+            yield formation, z, v, directions
 
 
 def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
-    rng = np.random.default_rng(12)
-    for curve, s, directions in states(curves):
-        z, z_s, z_ss = curve.evaluate(np.array([s]))[:3]
-        a, b, squeeze = random_motion(rng)
-        forces = inverse(curve.formation, z, z_s, z_ss, directions)
+    """Inverse and forward dynamics, and the paper's scalar equation of joint 1."""
+    rng = np.random.default_rng(18)
+    for formation, z, v, directions in every_state(curves):
+        if formation.n_constraints != 4:
+            continue
+        kinematics = formation.evaluate(z[None], v[None])
+        z_s, speed = v / np.linalg.norm(v), np.array([np.linalg.norm(v)])
+        z_ss = np.linalg.lstsq(kinematics.P[0], -kinematics.P_dot_v[0] / speed**2)[0]
+        motion = rng.uniform(-2, 2, 1), speed**2, rng.uniform(1, 5, 1)
+        forces = inverse(formation, z[None], z_s[None], z_ss[None], directions)
         assert np.linalg.norm(forces.of_c[0, :, LAMBDA]) == pytest.approx(1.0, abs=1e-12)
-        tau, c_n = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
-        v = z_s[0] * np.sqrt(b)
-        z_ddot = z_s[0] * a + z_ss[0] * b
-
-        acceleration, normal = forward(curve.formation, z[0], v, tau, directions)
-        size = np.abs(z_ddot).max() + 1
-        np.testing.assert_allclose(acceleration, z_ddot, rtol=0, atol=1e-10 * size)
-        np.testing.assert_allclose(normal, c_n, rtol=0, atol=1e-10 * np.abs(c_n).max())
-
-        Phi_1, Phi_2, Phi_3 = reduce_to_first_joint(curve.formation, z[0], v[3], tau, directions)
-        assert -(Phi_2 * v[3] + Phi_3) / Phi_1 == pytest.approx(z_ddot[3], abs=1e-10 * size)
+        tau, c = forces.tau(*motion)[0], forces.c(*motion)[0]
+        acceleration, found = forward(formation, z, v, tau, directions)
+        size, expected = 1 + np.abs(c).max(), z_s * motion[0] + z_ss * motion[1]
+        np.testing.assert_allclose(found, c, atol=1e-9 * size)
+        np.testing.assert_allclose(acceleration, expected, atol=1e-8 * size)
+        if reduced_inertia(formation, kinematics, directions)[0] > 0 and abs(v[3]) > 1e-3:
+            Phi_1, Phi_2, Phi_3 = reduce_to_first_joint(formation, z, v[3], tau, directions)
+            theta_1_ddot = -(Phi_2 * v[3] + Phi_3) / Phi_1
+            assert theta_1_ddot == pytest.approx(expected[3], abs=1e-7 * size)
 
 
-def newton_euler_residual(
-    formation: Formation, z: Array, v: Array, z_ddot: Array, tau: Array, c: Array
-) -> Array:
-    """What is missing in each body's balance: 2 forces and 1 moment, and 2 joint moments."""
-    n_c, rows = formation.n_contacts, list(formation.rolling_rows)
-    slip = measure_slip(formation, z, v)
-    assert (np.abs(slip[rows]) < 1e-14).all()
-    c_t = -formation.friction * np.sign(slip) * c[:n_c]
-    c_t[rows] = c[n_c:]
-    samples = Samples(z, v, z_ddot, tau, c[:n_c], c_t)
-    return np.asarray(unbalance(formation, samples, np.sign(v[3:]))[0])
-
-
-def test_every_body_obeys_newton_and_euler(curves: tuple[Curve, ...]) -> None:
-    rng = np.random.default_rng(13)
-    for curve, s, directions in states(curves):
-        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
-        v, tau = z_s * rng.uniform(0.1, 0.5), rng.uniform(-1, 1, 2)
-        z_ddot, c_n = forward(curve.formation, z, v, tau, directions)
-        residual = newton_euler_residual(curve.formation, z, v, z_ddot, tau, c_n)
-        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
-
-
-def test_accelerations_keep_the_contacts(curves: tuple[Curve, ...]) -> None:
-    for curve, s, directions in states(curves, 2):
-        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
-        v = 0.4 * z_s
-        z_ddot, _ = forward(curve.formation, z, v, np.array([1.0, -1.0]), directions)
-        h = 2e-5
-        path = [z + k * v + k**2 / 2 * z_ddot for k in (-h, 0.0, h)]
-        gaps = curve.formation.evaluate(np.array(path), np.zeros((3, 5))).C
-        # Rounding 1e-17 over h^2; the gap's fourth derivative times h^2.
-        np.testing.assert_allclose((gaps[0] - 2 * gaps[1] + gaps[2]) / h**2, 0.0, atol=1e-6)
+def test_every_body_obeys_newton_and_euler_and_contacts_are_kept(curves: tuple[Curve, ...]) -> None:
+    rng, h = np.random.default_rng(16), 2e-5
+    for formation, z, v, directions in every_state(curves):
+        tau, n_c, rolls = rng.uniform(-1, 1, 2), formation.n_contacts, list(formation.rolling_rows)
+        z_ddot, c = forward(formation, z, v, tau, directions)
+        assert c.shape == (formation.n_constraints,)
+        slip = measure_slip(formation, z, v)
+        assert (np.abs(slip[rolls]) < 1e-14).all()
+        c_t = -formation.friction * np.sign(slip) * c[:n_c]
+        c_t[rolls] = c[n_c:]
+        residual, _ = unbalance(formation, Samples(z, v, z_ddot, tau, c[:n_c], c_t), np.sign(v[3:]))
+        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c).max())
+        # Gap and slip coordinates keep their values to second order: rounding 1e-17 over h^2, and
+        # their fourth derivatives times h^2.
+        path = np.array([z + k * v + k**2 / 2 * z_ddot for k in (-h, 0.0, h)])
+        held = np.hstack([formation.evaluate(path, path).C, formation.evaluate_slip(path)])
+        size = 1 + np.abs(z_ddot).max()
+        np.testing.assert_allclose((held[0] - 2 * held[1] + held[2]) / h**2, 0, atol=1e-6 * size)
 
 
 def standing() -> tuple[Formation, Array]:
@@ -159,94 +165,15 @@ def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
     curves: tuple[Curve, ...],
 ) -> None:
     """It vanishes where z_s^T M5 w does, w the vector that no contact force acts on."""
-    for curve, s, directions in states(curves, 2):
-        formation = curve.formation
-        point = curve.evaluate(np.array([s]))
-        ratio = reduced_inertia(formation, formation.evaluate(point.z, point.z), directions)[0]
-        kinematics = formation.evaluate(point.z, point.z_s)
+    for formation, z, v, directions in sliding_states(curves, 2):
+        kinematics = formation.evaluate(z[None], v[None])
+        ratio = reduced_inertia(formation, kinematics, directions)[0]
         slip = (formation.friction * directions.Xi)[:, None]
         G = (kinematics.A - slip * kinematics.A_t)[0]
-
-        def null(matrix: Array) -> Array:
-            minors = [(-1) ** k * np.linalg.det(np.delete(matrix, k, axis=1)) for k in range(5)]
-            return np.array(minors)
-
-        mass, free, idle = formation.scene.mass_diagonal, null(kinematics.A[0]), null(G)
+        mass, free = formation.scene.mass_diagonal, find_null_vector(kinematics.A[0])
+        idle = find_null_vector(G)
         expected = (free * mass) @ idle / ((free * mass) @ free)
         assert ratio == pytest.approx(expected, rel=1e-9)
-
-
-def test_forward_takes_any_number_of_contacts(curves: tuple[Curve, ...]) -> None:
-    curve = curves[0]
-    for count in (1, 2, 3):
-        formation = Formation(curve.formation.scene, curve.formation.contacts[:count])
-        z = curve.start
-        A = formation.evaluate(z[None], z[None]).A[0]
-        v = 0.1 * np.linalg.svd(A)[2][-1]
-        slip = formation.evaluate(z[None], z[None]).A_t[0] @ v
-        directions = Directions(np.sign(slip), np.sign(v[3:]))
-        z_ddot, c_n = forward(formation, z, v, np.array([0.2, -0.1]), directions)
-        residual = newton_euler_residual(formation, z, v, z_ddot, np.array([0.2, -0.1]), c_n)
-        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
-
-
-def rolling_states(
-    curves: tuple[Curve, ...],
-) -> Iterator[tuple[Formation, Array, Array, Directions]]:
-    """Three of a curve's contacts, one of which rolls, with the velocity that is left free."""
-    for curve, s, _ in states(curves, 1):
-        scene, every = curve.formation.scene, curve.formation.contacts
-        for kept, rolls in (((1, 2, 3), 1), ((0, 2, 3), 2), ((1, 2, 3), 3)):
-            formation = Formation(scene, tuple(every[k] for k in kept), (every[rolls],))
-            z = curve.evaluate(np.array([s])).z
-            kinematics = formation.evaluate(z, z)
-            v = 0.3 * np.linalg.svd(kinematics.P[0])[2][-1]
-            slip = kinematics.A_t[0] @ v
-            if np.abs(np.delete(slip, formation.rolling_rows)).min() < 1e-9:
-                continue  # The other vertex of a flush edge does not slide either: it has no sign.
-            yield formation, z[0], v, Directions(np.sign(slip), np.sign(v[3:]))
-
-
-def test_rolling_contacts_obey_newton_and_euler(curves: tuple[Curve, ...]) -> None:
-    rng = np.random.default_rng(16)
-    h = 2e-5
-    for formation, z, v, directions in rolling_states(curves):
-        tau = rng.uniform(-1, 1, 2)
-        kinematics = formation.evaluate(z[None], v[None])
-        if reduced_inertia(formation, kinematics, directions)[0] <= 0.05:
-            continue
-        z_ddot, c = forward(formation, z, v, tau, directions)
-        residual = newton_euler_residual(formation, z, v, z_ddot, tau, c)
-        assert c.shape == (4,) and np.abs(residual).max() < 1e-12 * (1 + np.abs(c).max())
-        # Gap and slip coordinates keep their values to second order.
-        path = np.array([z + k * v + k**2 / 2 * z_ddot for k in (-h, 0.0, h)])
-        held = np.hstack([formation.evaluate(path, path).C, formation.evaluate_slip(path)])
-        size = 1 + np.abs(z_ddot).max()
-        np.testing.assert_allclose((held[0] - 2 * held[1] + held[2]) / h**2, 0, atol=1e-6 * size)
-
-
-def test_three_routes_agree_where_a_contact_rolls(curves: tuple[Curve, ...]) -> None:
-    rng = np.random.default_rng(18)
-    for formation, z, v, directions in rolling_states(curves):
-        kinematics = formation.evaluate(z[None], v[None])
-        if abs(reduced_inertia(formation, kinematics, directions)[0]) <= 0.05:
-            continue
-        z_s, speed = v / np.linalg.norm(v), float(np.linalg.norm(v))
-        P = kinematics.P[0]
-        z_ss = np.linalg.lstsq(P, -kinematics.P_dot_v[0] / speed**2)[0]
-        a, _, squeeze = random_motion(rng)
-        b = np.array([speed**2])
-        forces = inverse(formation, z[None], z_s[None], z_ss[None], directions)
-        tau, c = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
-        acceleration, found, _ = build_forward(formation)(z, v, tau, *directions)
-        size = 1 + np.abs(c).max()
-        np.testing.assert_allclose(found.full()[:, 0], c, atol=1e-9 * size)
-        expected = z_s * a + z_ss * b
-        np.testing.assert_allclose(acceleration.full()[:, 0], expected, atol=1e-8 * size)
-        if reduced_inertia(formation, kinematics, directions)[0] > 0 and abs(v[3]) > 1e-3:
-            Phi_1, Phi_2, Phi_3 = reduce_to_first_joint(formation, z, v[3], tau, directions)
-            theta_1_ddot = -(Phi_2 * v[3] + Phi_3) / Phi_1
-            assert theta_1_ddot == pytest.approx(expected[3], abs=1e-7 * size)
 
 
 def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
@@ -311,12 +238,6 @@ def arrivals(chain: ImpactSequence) -> list[tuple[Formation, Formation, Array, A
     return found
 
 
-def frictionless(formation: Formation) -> Formation:
-    scene = formation.scene
-    smooth = Scene(scene.polygon, scene.fingers, Friction(0.0, 0.0, 0.0), scene.gravity)
-    return Formation(smooth, formation.contacts)
-
-
 def check_momenta(impact: Impact, z: Array, before: Array) -> None:
     """Momentum of each body changes by the impulses at its contact points."""
     formation = impact.formation
@@ -337,15 +258,12 @@ def test_each_body_takes_its_impulses(rough: ImpactSequence, tipping: ImpactSequ
             impact = compute_impact(before, after, z, v)
             np.testing.assert_array_equal(impact.v, join.impact.v)
             check_momenta(impact, z, v)
-
-
-def test_every_contact_is_kept_afterwards(rough: ImpactSequence) -> None:
-    for before, after, z, v in arrivals(rough):
-        v_after, h = compute_impact(before, after, z, v).v, 1e-6
-        rates = (measure_gaps(after, z + h * v_after) - measure_gaps(after, z - h * v_after)) / h
-        assert np.abs(rates).max() < 1e-8
-        arriving = measure_gaps(after, z + h * v) - measure_gaps(after, z - h * v)
-        assert arriving.min() < -0.1 * h
+            # Every contact is kept afterwards, and one arrives before.
+            kept, arriving = (
+                measure_gaps(after, z + 1e-6 * u) - measure_gaps(after, z - 1e-6 * u)
+                for u in (impact.v, v)
+            )
+            assert np.abs(kept).max() < 1e-14 and arriving.min() < -1e-7
 
 
 @pytest.mark.parametrize("index", range(4))
@@ -379,19 +297,6 @@ def test_what_would_have_to_pull_is_named(tipping: ImpactSequence) -> None:
     assert first.describe() == "impulse on v1-palm would be -0.0414 N s"
 
 
-def test_energy_goes_into_the_jump_and_into_sliding(
-    rough: ImpactSequence, tipping: ImpactSequence
-) -> None:
-    for chain in (rough, tipping):
-        for before, after, z, v in arrivals(chain):
-            impact = compute_impact(before, after, z, v)
-            jump = energy_of(after.scene, impact.v - v)
-            slid = after.friction * impact.p @ np.abs(measure_slip(after, z, impact.v))
-            lost = energy_of(after.scene, v) - energy_of(after.scene, impact.v)
-            assert lost == pytest.approx(jump + slid, rel=1e-9)
-            assert lost > 0 or not impact.possible
-
-
 def test_random_impacts_never_gain_energy() -> None:
     rng = np.random.default_rng(5)
     scene = make_scene(SQUARE, friction=0.3)
@@ -408,25 +313,18 @@ def test_random_impacts_never_gain_energy() -> None:
             check_momenta(impact, z, v)
             slips = measure_slip(formation, z, impact.v)
             assert (impact.Xi * slips >= -1e-9).all()
+        else:
+            # No directions of sliding agree with the velocities that they lead to.
+            at = formation.evaluate(z[None], v[None])
+            for Xi in map(np.array, product((1.0, -1.0), repeat=3)):
+                G = at.A[0] - (formation.friction * Xi)[:, None] * at.A_t[0]
+                after, _ = solve_impulses(scene.mass_diagonal, at.A[0], G, v)
+                jams = reduced_inertia(formation, at, Directions(Xi, np.ones(2)))[0] <= 0
+                assert jams or (Xi * (at.A_t[0] @ after) < 0).any()
         if sound and impact.p.min() >= 0:
             possible += 1
             assert energy_of(scene, impact.v) <= energy_of(scene, v)
     assert possible > 5
-
-
-def test_without_friction_it_is_the_nearest_velocity(rough: ImpactSequence) -> None:
-    rng = np.random.default_rng(8)
-    for before, after, z, v in arrivals(rough):
-        impact = compute_impact(before, frictionless(after), z, v)
-        A = after.evaluate(z[None], v[None]).A[0]
-        tangents = np.linalg.svd(A)[2][len(A) :].T
-        root = np.sqrt(after.scene.mass_diagonal)
-        nearest = tangents @ np.linalg.lstsq(root[:, None] * tangents, root * v, rcond=None)[0]
-        np.testing.assert_allclose(impact.v, nearest, rtol=0, atol=1e-12)
-        least = energy_of(after.scene, impact.v - v)
-        for _ in range(20):
-            other = impact.v + tangents @ rng.normal(size=tangents.shape[1])
-            assert energy_of(after.scene, other - v) > least
 
 
 # A square that comes down on its right lower corner, r away from its centroid: one impulse.
@@ -528,21 +426,6 @@ def test_what_touches_must_not_be_driven_into() -> None:
             assert again.violations[0].describe() == "v0 touches the palm, at 0.12 m/s"
 
 
-def test_the_sliding_directions_are_found_among_all(rough: ImpactSequence) -> None:
-    """Every choice by brute force: the one taken is consistent, and no other one only presses."""
-    for before, after, z, v in arrivals(rough):
-        A, A_t = (part[0] for part in after.evaluate(z[None], v[None])[1:3])
-        found = []
-        for signs in product((1.0, -1.0), repeat=4):
-            G = A - (after.friction * np.array(signs))[:, None] * A_t
-            v_after, p = solve_impulses(after.scene.mass_diagonal, A, G, v)
-            if (np.array(signs) * (A_t @ v_after) >= 0).all():
-                found.append((signs, p))
-        impact = compute_impact(before, after, z, v)
-        assert tuple(impact.Xi) in [signs for signs, _ in found]
-        assert len([p for _, p in found if p.min() >= 0]) == impact.possible
-
-
 # Curves that impacts join.
 
 
@@ -640,34 +523,6 @@ def test_lemke_finds_one_of_all_answers() -> None:
         for answer in every:
             check(problem, answer)
         assert min(np.abs(found.change - a.change).max() for a in every) < 1e-8
-
-
-def make_mass(b_n: float, b_t: float, mu: float = 0.5) -> ContactProblem:
-    """A unit mass over a floor."""
-    normal, tangent = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]])
-    one, none = np.array([mu]), np.zeros(1)
-    b = np.array([b_n]), np.array([b_t])
-    return ContactProblem(np.ones(2), normal, normal, b[0], tangent, b[1], np.array([0]), one, none)
-
-
-@pytest.mark.parametrize(
-    ("b_n", "b_t", "mode", "c_n", "f"),
-    [
-        (-2.0, 0.5, STICKS, 2.0, -0.5),
-        (-2.0, 1.5, FORTH, 2.0, -1.0),
-        (-2.0, -1.5, BACK, 2.0, 1.0),
-        (2.0, 1.5, APART, 0.0, 0.0),
-    ],
-)
-def test_a_mass_on_a_floor(b_n: float, b_t: float, mode: int, c_n: float, f: float) -> None:
-    problem = make_mass(b_n, b_t)
-    (chosen,) = list_answers(problem, [mode])
-    for answer in (solve_problem(problem), chosen):
-        assert answer is not None
-        assert (*answer.c_n, *answer.f) == pytest.approx((c_n, f))
-    for other in {APART, STICKS, FORTH, BACK} - {mode}:
-        assert list_answers(problem, [other]) == []
-    assert len(list_answers(problem)) == 1
 
 
 def count_answers(K: Array, loads: Array) -> Array:

@@ -102,10 +102,9 @@ def test_pairs_are_the_contacts_that_problems_name(name: str) -> None:
 
 def pinch(torque: float, until: float = 10.0) -> tuple[Problem, TorqueProfile, Array]:
     """A square between two upright links, pressed by the same torque of both."""
-    link = dict(length=0.18, radius=0.005, inertia=0.005, viscous=0.01, dry=0.0, torque_limit=2.0)
-    square = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
-    fingers = Finger(base=(0.035, -0.01), **link), Finger(base=(-0.035, -0.01), **link)  # type: ignore[arg-type]
-    scene = Scene(Polygon(square, 0.2), fingers, Friction(0.6, 0.6, 0.6))
+    scene = make_scene(base=0.035, friction=0.6)
+    right, left = (dataclasses.replace(link, dry=0.0) for link in scene.fingers)
+    scene = dataclasses.replace(scene, fingers=(right, left))
     z = np.array([0, 0.08, 0, np.pi / 2, np.pi / 2])
     problem = Problem("pinch", scene, 0.05, z, (), checked=True)
     profile = TorqueProfile(np.array([0, until]), np.array([[[torque], [-torque]]]))
@@ -158,11 +157,9 @@ class Spring:
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 1.7])
 def test_a_law_is_sampled_held_and_late(share: float) -> None:
-    link = dict(length=0.18, radius=0.0, inertia=0.005, viscous=0.0, dry=0.0, torque_limit=2.0)
-    bases = ((0.4, -0.01), (-0.4, -0.01))
-    first, second = (Finger(base=base, **link) for base in bases)  # type: ignore[arg-type]
-    square = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
-    scene = Scene(Polygon(square, 0.2), (first, second), Friction(0.5, 0.5, 0.5))
+    scene = make_scene(base=0.4, radius=0.0, friction=0.5)
+    right, left = (dataclasses.replace(link, viscous=0.0, dry=0.0) for link in scene.fingers)
+    scene = dataclasses.replace(scene, fingers=(right, left))
     z = np.array([0, 0.03, 0, 1.3, 1.9])
     problem, law = Problem("spring", scene, 0.05, z, (), checked=True), Spring(0.007, share * 0.007)
     run = simulate_free(problem, law, start=z, until=0.05)

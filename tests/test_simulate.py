@@ -16,9 +16,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import wholearm
 from independent import balances, integrate_phase
-from plane import stack_rows
 from planned import (
     SQUEEZES,
     CosineMotion,
@@ -37,7 +35,6 @@ from rows import each
 from scenes import constant, hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
-from wholearm.benchmark.precision import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
@@ -45,14 +42,12 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
 from wholearm.problem.read import build_problem
-from wholearm.scene.model import Finger, Friction, Scene
+from wholearm.scene.model import Friction
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import Collapse, Mode, close_contacts, find_mode, find_rest, respond
+from wholearm.simulation.modes import Collapse, find_rest
 from wholearm.simulation.prescribed import Replay
 from wholearm.simulation.run import find_root
-from wholearm.simulation.stepper import ModeStepper, build_stepper
-from wholearm.simulation.system import ContactRows, build_system
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -65,17 +60,9 @@ def pick(index: int) -> tuple[Problem, CosineMotion]:
     return dataclasses.replace(problem, start=motion.curve.start, phases=(phase,)), motion
 
 
-def rebuild(problem: Problem, **edits: object) -> Problem:
-    """The problem on an edited scene."""
-    scene = dataclasses.replace(problem.scene, **edits)  # type: ignore[arg-type]
-    phases = tuple(
-        Phase(p.index, Formation(scene, p.formation.contacts), p.until) for p in problem.phases
-    )
-    return dataclasses.replace(problem, scene=scene, phases=phases)
-
-
-def smooth_fingers(scene: Scene) -> tuple[Finger, ...]:
-    return tuple(dataclasses.replace(f, viscous=0.0, dry=0.0) for f in scene.fingers)
+def with_friction(problem: Problem, *friction: float) -> Problem:
+    scene = dataclasses.replace(problem.scene, friction=Friction(*friction))
+    return dataclasses.replace(problem, scene=scene)
 
 
 def test_imports_nothing_of_the_planner() -> None:
@@ -188,21 +175,6 @@ def test_agrees_with_the_baseline(index: int) -> None:
     run = integrate_phase(problem, 0, torque, state, directions, (0.0, stop))
     found = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
     assert np.allclose(found, run.state, atol=1e-9, rtol=0)
-
-
-def test_energy_is_conserved_without_friction() -> None:
-    problem, motion = pick(3)
-    free = rebuild(problem, friction=Friction(0.0, 0.0, 0.0), fingers=smooth_fingers(problem.scene))
-    torque = CosineMotion(
-        dataclasses.replace(motion.curve, formation=free.phases[0].formation),
-        motion.duration,
-        motion.squeeze,
-    ).fit(1, 24)
-    energies = simulate(free, torque, tolerance=1e-11).energies
-    assert energies.work.max() > 1e-3
-    for loss in (energies.viscous, energies.dry, energies.contact):
-        assert not loss.any()
-    assert np.abs(energies.residual).max() < 1e-9 * energies.work.max()
 
 
 def test_sticks_without_torques() -> None:
@@ -344,7 +316,7 @@ def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
 def test_jamming_is_an_error_that_names_phase_and_time() -> None:
     problem, motion = pick(2)
     # On this much friction the phase starts, and jams on the way.
-    rough = rebuild(problem, friction=Friction(0.4, 0.1, 2.0))
+    rough = with_friction(problem, 0.4, 0.1, 2.0)
     curve = dataclasses.replace(motion.curve, formation=rough.phases[0].formation)
     torque = CosineMotion(curve, motion.duration, 0.3).fit(40, 7)
     place = r"v6-finger2 jams at t = 0\.1\d+ s, phase 1: friction"
@@ -355,7 +327,7 @@ def test_jamming_is_an_error_that_names_phase_and_time() -> None:
 
 def test_a_jammed_formation_at_rest() -> None:
     problem, motion = pick(1)
-    rough = rebuild(problem, friction=Friction(1.5, 1.5, 1.5))
+    rough = with_friction(problem, 1.5, 1.5, 1.5)
     rest = find_rest(rough.phases[0].formation, rough.start)
     assert max(way.response.ratio for way in rest.sliding) < 0
     simulation = simulate(rough, constant((0.0, 0.0)))
@@ -482,38 +454,6 @@ def test_replays_the_plan_through_its_impacts(
         rows = np.flatnonzero(replayed.phase == index)
         np.testing.assert_allclose(replayed.z_dot[rows[0]], start, rtol=0, atol=1e-7)
         np.testing.assert_allclose(replayed.z_dot[rows[-1]], stop, rtol=0, atol=1e-4)
-
-
-def test_momentum_is_that_of_the_impulses(problem: Problem, replayed: Simulation) -> None:
-    """The jump lies in the span of the pushes, with friction against sliding."""
-    for event in replayed.find(EventKind.IMPACT):
-        last, first = joints(replayed, event.phase)
-        formation = problem.phases[event.phase + 1].formation
-        N, T = stack_rows(formation, replayed.z[first])
-        slips = np.sign(T @ replayed.z_dot[first])
-        pushes = N - (formation.friction * slips)[:, None] * T
-        body, fingers = problem.scene.polygon, problem.scene.fingers
-        assert body.inertia is not None
-        mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in fingers)])
-        jump = mass * (replayed.z_dot[first] - replayed.z_dot[last])
-        p, residual, *_ = np.linalg.lstsq(pushes.T, jump, rcond=None)
-        assert residual.max() < 1e-12 * (jump @ jump)
-        assert p.min() == pytest.approx(event.value, rel=1e-6)
-        assert p.min() > 0
-
-
-def test_contacts_stay_closed_after_an_impact(problem: Problem, replayed: Simulation) -> None:
-    for index in (1, 2):
-        rows = replayed.phase == index
-        formation = problem.phases[index].formation
-        kinematics = formation.evaluate(replayed.z[rows], replayed.z_dot[rows])
-        assert np.abs(kinematics.C).max() < 1e-15
-        assert np.abs(np.einsum("nij,nj->ni", kinematics.A, replayed.z_dot[rows])).max() < 1e-13
-    # The contact given up opens.
-    start = replayed.t[replayed.phase == 1][0]
-    gone = problem.phases[0].formation.evaluate(replayed.z, replayed.z_dot).C[:, 2]
-    later = (replayed.t > start + 1e-4) & (replayed.phase == 1)
-    assert (gone[later] > 0).all() and gone[replayed.phase == 1].min() > -1e-12
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.3])
@@ -687,108 +627,3 @@ def test_answers_agree(make: Callable[[], Told], telling: Retelling) -> None:
     assert np.abs((other.z[-1] - ends) / [length, length, 1.0, 1.0, 1.0]).max() < 1e-8
     assert other.steps == pytest.approx(first.steps, abs=3)
     assert np.abs(other.energies.residual).max() < 1e-9 * np.abs(other.energies.work).max()
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2"),
-        ("v1-palm", "e3-tip1", "v6-finger2", "e6-tip2"),
-    ],
-)
-def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
-    problem, _ = plan()
-    formation = Formation(problem.scene, tuple(parse_contact(n, problem.scene) for n in names))
-    rng = np.random.default_rng(4)
-    for _ in range(5):
-        # Neither needs closed contacts: the equations are linear in the unknowns anywhere.
-        z, v = problem.start + 0.1 * rng.normal(size=5), rng.normal(size=5)
-        tau, signs = rng.normal(size=2), rng.choice([-1.0, 1.0], size=6)
-        directions = Directions(signs[:4], signs[4:])
-        expected = forward(formation, z, v, tau, directions)
-        found = solve_motion(problem.scene, formation.contacts, z, v, tau, *directions)
-        for a, b in zip(found, expected, strict=True):
-            assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-
-
-@each("power", range(8))
-def test_weights_integrate_polynomials(power: int) -> None:
-    nodes = np.array(stepper.NODES)
-    total = sum(w * nodes[j] ** power for j, w in stepper.WEIGHTS.items())
-    assert total == pytest.approx(1 / (power + 1), abs=1e-14)
-
-
-def load_stepper(mode: Mode, degree: int) -> ModeStepper:
-    """Steps of a formation in which friction holds some contacts and joints."""
-    system = build_system(mode.formation.scene)
-    s = build_stepper(system.structure, mode.find_modes(), degree)
-    s.load(system, 1e-9, np.zeros(5))
-    return s
-
-
-def test_order_on_the_real_dynamics() -> None:
-    _, trajectory = plan()
-    motion = trajectory.motions[1]
-    # One smooth piece for the whole phase, so that only the steps limit the error.
-    torque = motion.fit(1, 24)  # type: ignore[attr-defined]
-    s = load_stepper(find_mode(plan()[0].phases[1].formation, np.ones(6)), 24)
-    segment = motion.curve.segments[0]  # type: ignore[attr-defined]
-
-    def integrate(count: int) -> np.ndarray:
-        inputs, at = s.inputs, s.at
-        start = motion.evaluate(np.array([0.05]))
-        inputs[at.y] = [*start.z[0], *start.z_dot[0], *np.zeros(4)]
-        inputs[at.Xi], inputs[at.sigma] = segment.Xi, [0, 0, 0, *segment.sigma]
-        inputs[at.piece], inputs[at.torque] = torque.breaks, torque.coefficients.ravel()
-        inputs[at.h] = 0.3 / count
-        for k in range(count):
-            inputs[at.t] = 0.05 + 0.3 * k / count
-            s.step()
-            inputs[at.y] = s.outputs[s.to.y]
-        return np.array(s.outputs[s.to.y])
-
-    fine = integrate(64)
-    errors = [np.abs(integrate(count) - fine).max() for count in (3, 6)]
-    # Errors stay above 1e-12, well clear of rounding.
-    assert errors[1] > 1e-13
-    assert np.log2(errors[0] / errors[1]) > 7.5
-    exact = motion.evaluate(np.array([0.35]))
-    # A single polynomial of degree 24 follows the torques to about 1e-8.
-    assert np.allclose(fine[:10], np.hstack([exact.z[0], exact.z_dot[0]]), atol=1e-7, rtol=0)
-
-
-@pytest.mark.parametrize("row", [None, 1, 3], ids=["free", "a contact sticks", "a joint is held"])
-def test_rates_are_those_of_the_formations_own_rows(row: int | None) -> None:
-    problem = wholearm.load("problems/heptagon.toml")
-    free = problem.phases[2].formation
-    formations = [free] if row else [phase.formation for phase in problem.phases[:2]]
-    rng = np.random.default_rng(3)
-    for formation in formations:
-        # On the constraints, where gaps and slip of pairs are those of contacts.
-        z = close_contacts(formation, problem.start + 1e-3 * rng.standard_normal(5))
-        v = rng.standard_normal(5)
-        signs = rng.choice([-1.0, 1.0], formation.n_contacts + 2)
-        if row:
-            signs[row] = 0.0
-        mode = Mode(formation, ((row,),) if row else ())
-        s = load_stepper(mode, 1)
-        tau = rng.standard_normal(2)
-        inputs, at, to = s.inputs, s.at, s.to
-        inputs[at.y], inputs[at.t] = [*z, *v, *np.zeros(4)], 0.7
-        inputs[at.Xi], inputs[at.sigma] = signs[:-2], [0, 0, 0, *signs[-2:]]
-        inputs[at.piece], inputs[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
-        s.look()
-        kinematics = formation.evaluate(z[None], v[None])
-        turn = 1e-7 * v
-        ahead, back = (formation.evaluate((z + k * turn)[None], v[None]) for k in (1, -1))
-        bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
-        rows = ContactRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
-        response = respond(mode, signs, rows, v)
-        assert response is not None
-        load = np.array([1.0, *tau])
-        accelerations = response.acceleration @ load
-        assert s.outputs[to.acceleration] == pytest.approx(accelerations, rel=1e-6, abs=1e-9)
-        held = response.force_limits @ load
-        margins = s.outputs[to.values][: s.rows.cone.stop]
-        assert margins == pytest.approx(held / mode.force_limit_units, rel=1e-6)
-        assert s.outputs[to.c_n] == pytest.approx(held[: formation.n_contacts], rel=1e-6)

@@ -14,13 +14,13 @@ from scipy.optimize import brentq
 from independent import balances, integrate_phase, march
 from once import once
 from plane import convex_polygon, make_formation, make_scene, measure_slip, place_corners
-from planned import CosineMotion, LandingMotion, change, choose_squeeze, forward, join, plan_landing
-from pushing import Push, Roll, evaluate, linear, pushed, rocking
+from planned import CosineMotion, LandingMotion, change, choose_squeeze, forward, plan_landing
+from pushing import Push, Roll, pushed, rocking
 from scenes import POINTS, box, constant, falling, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
-from wholearm import End, Friction, Phase, Problem, Scene, TorqueProfile, Until, simulate, verify
+from wholearm import End, Friction, Phase, Problem, TorqueProfile, Until, simulate, verify
 from wholearm.common.arrays import Array
-from wholearm.contacts.closing import close_finger, place_flush
+from wholearm.contacts.closing import close_finger
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
@@ -36,7 +36,7 @@ def test_replay_keeps_the_vertex_where_it_is() -> None:
     simulation = simulate(box(), plan.torque, tolerance=1e-10, times=plan.t)
     assert simulation.outcome.reached and not simulation.find(EventKind.SLIP)
     rows = simulation.phase == 1
-    corners = np.array([place_corners(box().scene, z)[1] for z in simulation.z[rows]])
+    corners = place_corners(box().scene, simulation.z[rows])[:, 1]
     # Neither drift nor a jump on entering the phase.
     assert np.ptp(corners[:, 0]) < 1e-14 and np.abs(corners[:, 1]).max() < 1e-14
     assert simulation.energies.residual == pytest.approx(0.0, abs=1e-9)
@@ -82,25 +82,49 @@ def fall(mu: float, lean: float) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("mu, sign", [(0.25, 1.0), (0.36, 1.0), (0.6, -1.0)])
-def test_a_falling_box_slips_when_its_friction_cone_is_left(mu: float, sign: float) -> None:
-    """Closed form; on rough ground the vertex slips forwards, on smooth ground backwards."""
+def test_a_falling_box_keeps_its_vertex_until_its_cone_is_left(mu: float, sign: float) -> None:
+    """In closed form, whether the vertex has to roll, may slide, or does one after the other.
+
+    On rough ground it slips forwards, on smooth ground backwards.
+    """
     problem = falling(mu, 0.2)
+    rolling = problem.phases[0].formation
+    sliding = dataclasses.replace(rolling, rolling=())
+    torque, times = constant((-0.01, 0.01), 1.0), np.linspace(0.0, 0.2, 21)
+    rolls, sticks, both = (
+        simulate(divide(problem, formations), torque, tolerance=1e-12, times=times)
+        for formations in ([rolling], [sliding], [rolling, sliding])
+    )
     time, lean, c_t = fall(mu, 0.2)
     assert np.sign(c_t) == sign
-    simulation = simulate(problem, constant((-0.01, 0.01), 2.0), tolerance=1e-12)
-    assert simulation.outcome.kind is OutcomeKind.SLIPS
-    event = simulation.events[-1]
-    assert event.kind is EventKind.SLIP and event.contact == "v1-palm"
-    assert event.time == pytest.approx(time, abs=1e-9)
-    assert problem.start[2] - simulation.z[-1, 2] == pytest.approx(lean - 0.2, abs=1e-9)
-    assert simulation.c_t[-1, 0] == pytest.approx(c_t, abs=1e-8)
-    bound = mu * simulation.c_n[-1, 0]
-    assert simulation.outcome.text == (
+    end, slip = rolls.events[-1], sticks.find(EventKind.SLIP)[0]
+    (arrival,) = both.find(EventKind.ARRIVAL)
+    for simulation, event in ((rolls, end), (sticks, slip), (both, arrival)):
+        assert event.contact == "v1-palm" and event.time == pytest.approx(time, abs=1e-9)
+        row = int(np.flatnonzero(simulation.t == event.time)[0])
+        assert problem.start[2] - simulation.z[row, 2] == pytest.approx(lean - 0.2, abs=1e-9)
+        assert simulation.c_t[row, 0] == pytest.approx(c_t, abs=1e-8)
+        corners = place_corners(problem.scene, simulation.z[: row + 1])[:, 1]
+        assert np.abs(corners - corners[0]).max() < 1e-13
+        assert not simulation.energies.contact[: row + 1].any()
+        assert_balanced(simulation)
+    bound = mu * rolls.c_n[-1, 0]
+    assert rolls.outcome.kind is OutcomeKind.SLIPS and end.kind is EventKind.SLIP
+    assert rolls.outcome.text == (
         f"v1-palm slips: |c_t| = {abs(c_t):.5g} N reaches mu c_n = {bound:.5g} N "
         f"at t = {time:.5g} s, phase 1"
     )
-    corner = np.array([place_corners(problem.scene, z)[1] for z in simulation.z])
-    assert np.abs(corner - corner[0]).max() < 1e-14
+    assert slip.text == arrival.text == f"v1-palm slips at t = {time:.5g} s, phase 1"
+    # The force goes on from one side of the jump to the other, and sliding is against it.
+    after = int(np.flatnonzero(sticks.t == slip.time)[1])
+    assert sticks.c_t[after, 0] == pytest.approx(c_t, abs=1e-8)
+    rows = slice(after + 1, after + 4)
+    slipping = measure_slip(sliding, sticks.z[rows], sticks.z_dot[rows])[:, 0]
+    assert (np.sign(slipping) == -sign).all() and sticks.energies.contact[-1] > 0
+    # A phase that ends there makes no difference to what follows.
+    assert both.outcome.kind is sticks.outcome.kind is OutcomeKind.LIMIT_REACHED
+    for t in times:
+        np.testing.assert_allclose(both.at(t), sticks.at(t), rtol=0, atol=1e-10)
 
 
 def test_a_box_cannot_start_to_roll_without_enough_friction() -> None:
@@ -117,24 +141,13 @@ def test_a_box_cannot_start_to_roll_without_enough_friction() -> None:
     assert "exceeds mu c_n" in short.outcome.text and short.events[-1].time == 0.0
 
 
-def push_box(mu: float) -> tuple[Problem, Array]:
-    """A box that finger 1 pushes to the left while vertex 0 holds it; finger 2 is far off."""
-    scene = make_scene([[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]], base=0.1)
-    left = dataclasses.replace(scene.fingers[1], base=[-0.5, -0.01], viscous=0.0, dry=0.0)
-    friction = Friction(mu, 0.1, 0.1)
-    scene = Scene(scene.polygon, (scene.fingers[0], left), friction)
-    q = place_flush(scene, 0, 0.0)
-    z = np.array([*q, close_finger(scene, q, 0), np.pi / 2])
-    formation = roll(make_formation(scene, "v0-palm v1-palm v2-finger1"), "v0-palm")
-    phase = Phase(0, formation, Until(coordinate="x", value=-0.2))
-    return Problem("pushed box", scene, 0.0, z, (phase,)), z
-
-
 def test_a_rising_push_slips_a_box_when_statics_say_so() -> None:
     """The box does not move until then, so its forces follow from the torque by statics."""
     mu, rate = 0.3, 0.2
-    problem, z = push_box(mu)
-    scene = problem.scene
+    problem = pushed(mu)
+    (phase,) = problem.phases
+    phase = dataclasses.replace(phase, formation=roll(phase.formation, "v0-palm"))
+    problem, scene, z = replace_phases(problem, phase), problem.scene, problem.start
     corner = place_corners(scene, z)[2]
     run = np.sqrt(np.sum((corner - scene.fingers[0].base) ** 2) - scene.fingers[0].radius ** 2)
     n = np.array([-np.sin(z[3]), np.cos(z[3])])
@@ -193,38 +206,6 @@ def assert_balanced(simulation: Simulation) -> None:
     assert np.abs(energies.residual).max() < 1e-9 * size
 
 
-@pytest.mark.parametrize("mu, sign", [(0.25, 1.0), (0.36, 1.0), (0.6, -1.0)])
-def test_a_falling_box_sticks_until_its_cone_is_left(mu: float, sign: float) -> None:
-    """In closed form the vertex sticks as it would roll, then slips against its last force."""
-    problem = falling(mu, 0.2)
-    (phase,) = problem.phases
-    slides = dataclasses.replace(phase.formation, rolling=())
-    problem = dataclasses.replace(problem, phases=(dataclasses.replace(phase, formation=slides),))
-    time, lean, c_t = fall(mu, 0.2)
-    simulation = simulate(problem, constant((-0.01, 0.01), 1.0), tolerance=1e-12)
-    slip = simulation.find(EventKind.SLIP)[0]
-    assert (slip.contact, slip.text) == ("v1-palm", f"v1-palm slips at t = {time:.5g} s, phase 1")
-    assert slip.time == pytest.approx(time, abs=1e-9)
-    before, after = np.flatnonzero(simulation.t == slip.time)
-    (start,) = (e for e in simulation.events if e.time < slip.time)
-    assert start.kind is EventKind.START
-    assert problem.start[2] - simulation.z[before, 2] == pytest.approx(lean - 0.2, abs=1e-9)
-    assert simulation.c_t[before, 0] == pytest.approx(c_t, abs=1e-8)
-    # The force goes on from one side of the jump to the other.
-    assert simulation.c_t[after, 0] == pytest.approx(c_t, abs=1e-8)
-    corner = np.array([place_corners(problem.scene, z)[1] for z in simulation.z])
-    assert np.abs(corner - corner[0])[: before + 1].max() < 1e-13
-    rows = slice(after + 1, None)
-    slipping = [
-        measure_slip(slides, z, v)[0]
-        for z, v in zip(simulation.z[rows], simulation.z_dot[rows], strict=True)
-    ]
-    assert np.sign(c_t) == sign and (np.sign(slipping[:3]) == -sign).all()
-    assert not simulation.energies.contact[: after + 1].any()
-    assert simulation.energies.contact[-1] > 0
-    assert_balanced(simulation)
-
-
 def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
     """Piecewise cubics: J theta'' = tau - D sgn(theta'), and rest where |tau| <= D."""
     problem = pushed(contacts="v0-palm v1-palm")
@@ -236,7 +217,8 @@ def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
     phase = dataclasses.replace(phase, formation=make_formation(scene, "v0-palm v1-palm"))
     problem = dataclasses.replace(problem, scene=scene, start=away, phases=(phase,))
     D, J = swings.dry, swings.inertia
-    torque = linear([0.0, 0.1, 0.3, 0.4], [0.0, 2 * D, -2 * D, -2 * D], [1e-3] * 4)
+    tau = np.column_stack([[0.0, 2 * D, -2 * D, -2 * D], np.full(4, 1e-3)])
+    torque = TorqueProfile.join_rows(np.array([0.0, 0.1, 0.3, 0.4]), tau)
     simulation = simulate(problem, torque, tolerance=1e-12, times=[0.23, 0.24])
     # It starts at tau = D, is fastest when tau is D again, and is as slow when it has lost that.
     peak = 2 * 0.5 * D / J * 0.05
@@ -280,7 +262,7 @@ def test_a_rising_push_slips_a_flush_edge_when_both_cones_are_left() -> None:
     problem = pushed()
     rate = 0.5
     # Finger 2 keeps moving, so that the box is stuck and not at rest.
-    torque = linear([0.0, 1.0], [0.0, rate], [1e-3, 1e-3])
+    torque = ramp((0.0, 1e-3), (rate, 0.0), 1.0)
     simulation = simulate(problem, torque, tolerance=1e-11)
     slips = simulation.find(EventKind.SLIP)
     # The finger leans on the box, so that all of it starts to move at once.
@@ -307,10 +289,7 @@ def test_time_stepping_agrees_while_a_box_is_pushed_and_sticks() -> None:
     assert moved < -0.005
     errors = []
     for n in (150, 300, 600):
-        z, _ = march(
-            problem.phases[0].formation, problem.start, np.zeros(5),
-            lambda t: evaluate(rocking(), t), 0.6, n,
-        )  # fmt: skip
+        z, _ = march(problem.phases[0].formation, problem.start, np.zeros(5), rocking(), 0.6, n)
         errors.append(float(np.abs(z[-1] - simulation.z[-1]).max()))
     assert errors[2] < 0.65 * errors[1] < 0.42 * errors[0] < 0.02 * abs(moved)
 
@@ -348,24 +327,12 @@ def test_a_vertex_sticks_and_slips_in_a_landing_of_the_heptagon() -> None:
     palm = [e for e in simulation.events if e.contact == "v1-palm" and e.phase == 1]
     assert [e.kind.value for e in palm] == ["stick", "slip", "stick", "slip"]
     assert_balanced(simulation)
-    (release,) = simulation.find(EventKind.RELEASE)
-    row = int(np.flatnonzero(simulation.t == release.time)[-1])
     column = simulation.contacts.index("v1-palm")
-    share = np.abs(simulation.c_t[row:, column] / simulation.c_n[row:, column]) / 0.1
+    share = np.abs(simulation.c_t[:, column] / simulation.c_n[:, column]) / 0.1
     held = np.zeros(len(share), dtype=bool)
     for stuck, slipped in (palm[:2], palm[2:]):
-        held |= (simulation.t[row:] > stuck.time) & (simulation.t[row:] < slipped.time)
+        held |= (simulation.t > stuck.time) & (simulation.t < slipped.time)
     assert share[held].max() < 1 + 1e-9 and held.sum() > 5
-    stop, errors = 0.55, []
-    end = simulate(problem, trajectory.torque, tolerance=1e-11, times=[stop]).at(stop)
-    formation = problem.phases[1].formation
-    for n in (100, 200):
-        z, _ = march(
-            formation, simulation.z[row], simulation.z_dot[row],
-            lambda t: evaluate(trajectory.torque, release.time + t), stop - release.time, n,
-        )  # fmt: skip
-        errors.append(float(np.abs(z[-1] - end[:5]).max()))
-    assert errors[1] < 0.65 * errors[0] < 0.01
 
 
 def divide(problem: Problem, formations: Sequence[Formation]) -> Problem:
@@ -374,29 +341,6 @@ def divide(problem: Problem, formations: Sequence[Formation]) -> Problem:
     first = [Phase(k, one, Until(), End.SMOOTH) for k, one in enumerate(formations[:-1])]
     final = dataclasses.replace(last, index=len(first), formation=formations[-1])
     return dataclasses.replace(problem, phases=(*first, final))
-
-
-@pytest.mark.parametrize("mu", [0.25, 0.36, 0.6])
-def test_a_falling_box_rolls_until_it_slips_in_closed_form(mu: float) -> None:
-    """The phase ends when the cone is left; then it is as if there had been one sliding phase."""
-    problem = falling(mu, 0.2)
-    rolling = problem.phases[0].formation
-    sliding = dataclasses.replace(rolling, rolling=())
-    torque, times = constant((-0.01, 0.01), 1.0), np.linspace(0.0, 0.2, 21)
-    both, alone = (
-        simulate(divide(problem, formations), torque, tolerance=1e-12, times=times)
-        for formations in ([rolling, sliding], [sliding])
-    )
-    time = fall(mu, 0.2)[0]
-    (end,) = both.find(EventKind.ARRIVAL)
-    assert (end.phase, end.contact) == (0, "v1-palm")
-    assert end.time == pytest.approx(time, abs=1e-9)
-    assert end.text == f"v1-palm slips at t = {time:.5g} s, phase 1"
-    assert both.outcome.kind is alone.outcome.kind is OutcomeKind.LIMIT_REACHED
-    for t in times:
-        np.testing.assert_allclose(both.at(t), alone.at(t), rtol=0, atol=1e-10)
-    # It slides, and friction takes energy, from there on only.
-    assert not both.energies.contact[both.phase == 0].any() and both.energies.contact[-1] > 0
 
 
 @pytest.mark.parametrize("share, late", [(0.3, -3e-10), (-0.8, 3e-10)])
@@ -468,7 +412,7 @@ def draw(rng: np.random.Generator) -> tuple[Problem, TorqueProfile] | None:
         return None
     phase = Phase(0, Formation(scene, contacts), Until(coordinate="x", value=-5.0))
     tau = 10 ** rng.uniform(-1.5, 0.2) * np.abs(rng.normal(size=(2, 6)))
-    torque = linear(np.linspace(0.0, 0.3, 6), tau[0], (-tau[1]).tolist())
+    torque = TorqueProfile.join_rows(np.linspace(0.0, 0.3, 6), (tau * [[1], [-1]]).T)
     return Problem("random", scene, 0.0, z, (phase,)), torque
 
 
@@ -483,10 +427,7 @@ def test_agrees_with_time_stepping(seed: int) -> None:
     moved, errors = np.abs(end[:5] - problem.start).max(), []
     assert moved > 1e-4
     for n in (100, 400):
-        z, _ = march(
-            problem.phases[0].formation, problem.start, np.zeros(5),
-            lambda t: evaluate(torque, t), stop, n,
-        )  # fmt: skip
+        z, _ = march(problem.phases[0].formation, problem.start, np.zeros(5), torque, stop, n)
         errors.append(float(np.abs(z[-1] - end[:5]).max() / moved))
     assert errors[1] < 0.5 * errors[0] or errors[1] < 1e-4
     assert errors[1] < 0.02
@@ -676,7 +617,7 @@ def test_start_with_a_contact_that_sticks() -> None:
     moved = simulation.z[-1] - z
     errors = []
     for n in (20, 40):
-        marched, _ = march(phase.formation, z, np.zeros(5), lambda t: tau, 0.01, n)
+        marched, _ = march(phase.formation, z, np.zeros(5), constant(tau, 0.01), 0.01, n)
         errors.append(float(np.abs(marched[-1] - z - moved).max()))
     assert errors[1] < 0.6 * errors[0] < 0.06 * np.abs(moved).max()
 
@@ -724,7 +665,9 @@ def test_a_pointed_tip_gains_either_edge_at_a_vertex(until: str) -> None:
     corner = np.array([curves[0].end[0] - 0.05, 0.0433]) - problem.scene.fingers[1].base
     assert np.hypot(*corner) == pytest.approx(0.057, rel=1e-9)
     motions = [CosineMotion(c, 0.4, choose_squeeze(c, 0.4, 0.2, 2.0)) for c in curves]
-    simulation = simulate(problem, join([motion.fit(20, 7) for motion in motions]), times=[0.2])
+    simulation = simulate(
+        problem, TorqueProfile.chain([motion.fit(20, 7) for motion in motions]), times=[0.2]
+    )
     assert simulation.outcome.reached
     halfway = motions[0].evaluate(np.array([0.2])).z[0]
     np.testing.assert_allclose(simulation.at(0.2)[:5], halfway, atol=1e-9)

@@ -98,15 +98,7 @@ def drive(
 ) -> Sampler:
     """Motion from rest at `z` under a torque that is linear in time, by plain Newton and Euler.
 
-    Parameters
-    ----------
-    tau : ndarray, shape (2, 2), [N m]
-        At the start and at the end.
-
-    Returns
-    -------
-    callable
-        (scheme, number of intervals) -> StagePoints.
+    `tau` has the torques at the start and at the end in its rows [N m].
     """
 
     def torque(t: float) -> Array:
