@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from plane import SQUARE, make_formation, make_scene
+from plane import SQUARE, make_formation, make_scene, with_speed_limit
 from rows import each
 from scenes import roll
 from wholearm import Objective
@@ -22,7 +19,7 @@ from wholearm.common.arrays import Array, find_minima
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.closing import contact_table
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve, Segment, directions_of
+from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
@@ -38,16 +35,9 @@ from wholearm.mechanics.speed_sweep import (
 from wholearm.planning.explain import change_limit, list_shortfalls
 from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.path_data import choose_sampling, fit_torque, prepare
-from wholearm.planning.path_domain.path_mesh import make_grid
+from wholearm.planning.path_domain.path_data import choose_sampling, prepare
 from wholearm.planning.path_domain.path_motion import (
-    DEGREE,
-    FROM_REST,
-    INSIDE,
-    TO_REST,
     PathMotion,
-    Profile,
-    find_basis,
 )
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
@@ -281,18 +271,11 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
 FREE = (None, None)
 
 
-def limit_fast(formation: Formation) -> Formation:
-    """The formation with limits of the joint speeds."""
-    scene = formation.scene
-    one, two = (replace(finger, speed_limit=3.0) for finger in scene.fingers)
-    return replace(formation, scene=replace(scene, fingers=(one, two)))
-
-
 @pytest.mark.parametrize("phase", [0, 2])
 def test_slack_is_that_of_the_motion(curves: tuple[Curve, ...], phase: int) -> None:
     """Contact forces by forward dynamics under the torques of the coefficients."""
     curve, rng, count = curves[phase], np.random.default_rng(phase), 40
-    formation = limit_fast(curve.formation)
+    formation = with_speed_limit(curve, (3.0, 3.0)).formation
     s = rng.uniform(0, curve.length, count)
     point, segment = curve.evaluate(s), np.searchsorted([p.stop for p in curve.segments[:-1]], s)
     a, b, internal = (rng.uniform(*ends, count) for ends in ((-9, 9), (0, 2), (0, 5)))
@@ -547,44 +530,6 @@ def test_a_margin_that_a_place_limits_does_not_grow_with_the_duration(
     assert at_leisure == pytest.approx(at_once, rel=5e-4)
 
 
-@pytest.mark.parametrize("phase, contact, row", [(0, 0, 37), (1, 3, 500), (3, 1, 0), (4, 2, 1199)])
-def test_a_planted_miss_is_found(
-    curves: tuple[Curve, ...], phase: int, contact: int, row: int
-) -> None:
-    data = prepare(curves[phase], EPSILON, make_grid(curves[phase], np.zeros(0), 21), 1)
-    motion = plan_path(curves[phase], EPSILON, PlanOptions(intervals=81), 1).motion
-    data = prepare(curves[phase], EPSILON, motion.grid, 1)
-    short, speeding = data.misses(motion.profile, 0.0)
-    assert short.max() <= 5e-7 and speeding.max() == 0.0
-    row = min(row, len(data.checks.rates) - 1)
-    here = data.slack(data.checks, data.interpolate(motion.profile, data.sampling.checks))[
-        row, contact
-    ]
-    C = data.checks.forces.of_c.copy()
-    C[row, contact, ONE] -= here + 0.25
-    planted = data._replace(checks=data.checks._replace(forces=data.checks.forces._replace(of_c=C)))
-    short, _ = planted.misses(motion.profile, 0.0)
-    interval = row // len(data.sampling.checks)
-    # A parabola through the place and its neighbours may dip a little beyond it.
-    assert 0.25 - 1e-9 <= short[interval, contact] <= 0.25 + 0.04
-    short[:, contact] = 0.0
-    assert short.max() <= 5e-7
-
-
-@pytest.mark.parametrize("phase", [1, 4])
-def test_effort_is_the_integral_of_squared_torque(curves: tuple[Curve, ...], phase: int) -> None:
-    curve = curves[phase]
-    motion = plan_path(curve, EPSILON, PlanOptions(objective="effort"), 1).motion
-    _, squares = fit_torque(prepare(curve, EPSILON, motion.grid, 1), motion)
-
-    # tau has a kink at every node, so the rule is for single intervals.
-    x, weights = np.polynomial.legendre.leggauss(12)
-    h = np.diff(motion.times)[:, None]
-    t = motion.times[:-1, None] + h * (x + 1) / 2
-    power = (motion.evaluate(t.ravel()).tau ** 2).sum(axis=1).reshape(t.shape)
-    assert squares == pytest.approx((h / 2 * weights * power).sum(), rel=1e-7)
-
-
 @each("nodes", [11, 81])
 @each("deepest", [3e-3, 0.01, 0.05])
 def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
@@ -595,65 +540,3 @@ def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
         least = find_minima(sampled[None, :, None])[0, 0]
         # A look next to the dip, and the parabola through it, miss little of it.
         assert least == pytest.approx(-deepest, rel=0.1)
-
-
-SEEDS = range(4)
-
-
-def stub_curve(length: float, breaks: list[float]) -> Curve:
-    ends = [0.0, *breaks, length]
-    stub: Any = SimpleNamespace(
-        length=length,
-        segments=tuple(Segment(a, b, np.ones(4), np.ones(2)) for a, b in pairwise(ends)),
-        formation=SimpleNamespace(names=("v0-palm",)),
-    )
-    curve: Curve = stub
-    return curve
-
-
-def random_motion(seed: int) -> PathMotion:
-    """From rest to rest over a random grid, with a jump of a where two segments meet."""
-    rng = np.random.default_rng(seed)
-    length, break_at = rng.uniform(0.02, 0.5), rng.uniform(0.2, 0.8)
-    curve = stub_curve(length, [break_at * length])
-    grid = make_grid(curve, np.zeros(0), 6)
-    x = grid.s / length
-    waves = rng.uniform(-0.4, 0.4, 2)
-    a = (1 - 2 * x) * (1 + waves[0] * np.sin(5 * x)) + 0.3 * waves[1] * grid.segment
-    a = rng.uniform(0.5, 20.0) * (a - grid.integrate(a)[-1] / (2 * length))
-    b = grid.integrate(a)
-    b[-1] = 0.0
-    assert (b[1:-1] > 0).all()
-    return PathMotion(curve, grid, Profile(a, b, rng.uniform(0, 1, len(a))))
-
-
-def acceleration(motion: PathMotion, element: int, s: Array) -> Array:
-    """S'' at places of an element, by an interpolation of its own."""
-    grid = motion.grid
-    start, stop = grid.edges[element]
-    share = np.clip((s - start) / (stop - start), 0.0, 1.0)
-    kind = int(grid.kinds[element])
-    y = {INSIDE: share, FROM_REST: np.sqrt(share), TO_REST: np.sqrt(1 - share)}[kind]
-    nodes = find_basis().y[kind]
-    own = motion.profile.a[element * (DEGREE + 1) : (element + 1) * (DEGREE + 1)]
-    return np.polyval(np.polyfit(nodes, own, DEGREE), y)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_motion_integrates_its_acceleration(seed: int) -> None:
-    """S'' is that of the elements, s' its integral over time, and s that of s'."""
-    motion = random_motion(seed)
-    length, nodes, weights = motion.curve.length, *np.polynomial.legendre.leggauss(20)
-    speed, place = 0.0, 0.0
-    for k in motion.grid.nonempty.tolist():
-        start, stop = motion.times[k], motion.times[k + 1]
-        t = start + (1 + nodes) / 2 * (stop - start)
-        s, _, here = motion.locate(t)
-        expected = acceleration(motion, k // (DEGREE + 1), s)
-        scale = np.abs(motion.profile.a).max()
-        np.testing.assert_allclose(here.a, expected, rtol=0, atol=1e-9 * scale)
-        place += (stop - start) / 2 * float(weights @ np.sqrt(here.b))
-        speed += (stop - start) / 2 * float(weights @ here.a)
-        assert place == pytest.approx(motion.grid.s[k + 1], abs=1e-10 * length)
-        top = math.sqrt(motion.profile.b.max())
-        assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-9 * top)

@@ -27,11 +27,6 @@ OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0
 
 
-@pytest.fixture(scope="module")
-def plans() -> dict[str, Trajectory]:
-    return {name: plan_of(HEPTAGON, name) for name in OBJECTIVES}
-
-
 def check_balance(problem: Problem, phase: int, rows: Samples, sigmas: Array) -> None:
     """Equations of motion, closed contacts and Coulomb's law, body by body, for every row."""
     formation = problem.phases[phase].formation
@@ -66,26 +61,22 @@ def test_random_instants_obey_newton_and_euler(path: Path, objective: str) -> No
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_phases_join_at_rest(plans: dict[str, Trajectory], objective: str) -> None:
-    trajectory = plans[objective]
+def test_phases_join_at_rest(objective: str) -> None:
+    trajectory = plan_of(HEPTAGON, objective)
     starts = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
     ends = np.append(starts[1:], len(trajectory.t)) - 1
     np.testing.assert_allclose(trajectory.t[starts[1:]], trajectory.t[ends[:-1]], atol=1e-13)
     np.testing.assert_allclose(trajectory.z[starts[1:]], trajectory.z[ends[:-1]], atol=1e-11)
+    np.testing.assert_allclose(trajectory.z[0], problem_of(HEPTAGON).start, atol=1e-12)
+    assert trajectory.q[-1, 2] == pytest.approx(np.radians(-50.0), abs=1e-11)
     # b is zero to rounding, and the speed its root.
     assert np.abs(trajectory.z_dot[np.append(starts, ends)]).max() < 1e-6
     assert np.abs(trajectory.z_ddot[np.append(starts, ends)]).max(axis=1).min() > 0.1
 
 
-def test_motion_goes_where_it_should(heptagon: Problem, plans: dict[str, Trajectory]) -> None:
-    for trajectory in plans.values():
-        np.testing.assert_allclose(trajectory.z[0], heptagon.start, atol=1e-12)
-        assert trajectory.q[-1, 2] == pytest.approx(np.radians(-50.0), abs=1e-11)
-
-
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_velocities_are_derivatives(plans: dict[str, Trajectory], objective: str) -> None:
-    trajectory, rng = plans[objective], np.random.default_rng(2)
+def test_velocities_are_derivatives(objective: str) -> None:
+    trajectory, rng = plan_of(HEPTAGON, objective), np.random.default_rng(2)
     for motion in trajectory.motions:
         t = rng.uniform(0.05, 0.95, 300) * motion.duration
         h = 2e-4 * motion.duration
@@ -105,10 +96,8 @@ def test_velocities_are_derivatives(plans: dict[str, Trajectory], objective: str
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_torque_profile_is_that_of_the_motions(
-    plans: dict[str, Trajectory], objective: str
-) -> None:
-    trajectory, rng = plans[objective], np.random.default_rng(3)
+def test_torque_profile_is_that_of_the_motions(objective: str) -> None:
+    trajectory, rng = plan_of(HEPTAGON, objective), np.random.default_rng(3)
     starts = trajectory.phase_starts
     assert trajectory.torque.breaks[0] == 0.0
     assert trajectory.torque.breaks[-1] == pytest.approx(trajectory.duration, abs=1e-13)
@@ -133,8 +122,8 @@ def test_torque_profile_is_that_of_the_motions(
     assert steps > 0.1
 
 
-def test_objectives_trade_against_each_other(plans: dict[str, Trajectory]) -> None:
-    time, effort, margin = (plans[name] for name in OBJECTIVES)
+def test_objectives_trade_against_each_other() -> None:
+    time, effort, margin = (plan_of(HEPTAGON, name) for name in OBJECTIVES)
 
     def squares(trajectory: Trajectory) -> float:
         parts = [trajectory.phase == k for k in range(5)]
@@ -167,10 +156,8 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_meta_says_how_it_was_made(
-    heptagon: Problem, plans: dict[str, Trajectory], objective: str
-) -> None:
-    trajectory = plans[objective]
+def test_meta_says_how_it_was_made(heptagon: Problem, objective: str) -> None:
+    trajectory = plan_of(HEPTAGON, objective)
     meta = json.loads(json.dumps(dict(trajectory.meta)))
     assert meta == trajectory.meta
     assert (meta["status"], meta["objective"]) == ("solved", objective)

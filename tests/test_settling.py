@@ -361,19 +361,6 @@ def test_phases_over_time_take_as_long_as_along_their_curves(heptagon: Problem) 
         )
 
 
-def test_torques_ramp_into_what_holds_an_end_and_out_of_it(heptagon: Problem) -> None:
-    problem = replace(heptagon, settle=0.01).with_(torque_rate_limit=500.0)
-    plan = solve(problem, replay=False, intervals=40)
-    torque = plan.trajectory.torque
-    assert describe_motors(problem, torque) == []
-    for phase in plan.phases:
-        assert phase.settling is not None and phase.settling.duration == 0.01
-        end = plan.trajectory.phase_starts[phase.number] - 1e-9
-        held = torque.at(np.array([end - 0.009, end]))
-        np.testing.assert_allclose(held, [phase.settling.tau] * 2, atol=1e-9)
-    assert simulate(problem, torque).outcome.kind is OutcomeKind.GOAL_REACHED
-
-
 @pytest.mark.parametrize(("key", "value"), [("torque_rate_limit1", -1.0), ("actuator_lag", 1e6)])
 def test_keys_of_motors_are_checked_and_kept(heptagon: Problem, key: str, value: float) -> None:
     with pytest.raises(InputError, match=key.rstrip("1")):
