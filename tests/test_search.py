@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 import tomllib
 from dataclasses import replace
@@ -45,6 +44,7 @@ from wholearm.planning.lower_bound import bound_least_time
 from wholearm.planning.phase_plan import PhasePlan, end_of
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
+from wholearm.problem.table import write_toml
 from wholearm.search.astar import (
     FINEST,
     RefinedPath,
@@ -308,11 +308,7 @@ OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
 def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
-    problem = problem_of(HEPTAGON)
-    search = RouteSearch(
-        Roadmap(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6)
-    )
-    route = next(search.run())
+    problem, (_, route) = problem_of(HEPTAGON), to_edge_6()
     parts = split_route(route.edges)
     assert tuple(edge for part in parts for edge in part) == route.edges
     assert len(parts) > 1 and not any(part[-1].in_cell for part in parts[:-1])
@@ -466,22 +462,12 @@ HEPTAGON_TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 FLAT = -1.984
 
 
-def write_table(table: dict[str, Any], path: str = "") -> str:
-    """A problem file's tables as TOML, without its phases."""
-    plain = {k: v for k, v in table.items() if not isinstance(v, dict) and k != "phases"}
-    lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
-    for key, value in table.items():
-        if isinstance(value, dict):
-            lines += [f"[{path}{key}]", write_table(value, f"{path}{key}.")]
-    return "\n".join(lines) + "\n"
-
-
 def load_pasted(table: dict[str, Any], route: Route, folder: Path) -> Problem:
     """What loading gives when the list replaces what it names in a problem file."""
     text = format_route(route)
     kept = {key: value for key, value in table.items() if key not in tomllib.loads(text)}
     path = folder / "pasted.toml"
-    path.write_text(write_table(kept) + text, encoding="utf-8")
+    path.write_text(write_toml(kept) + text, encoding="utf-8")
     return wholearm.load(str(path))
 
 
