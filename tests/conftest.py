@@ -5,6 +5,7 @@ import math
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -69,6 +70,23 @@ def heptagon() -> Problem:
     from shipped import HEPTAGON, problem_of
 
     return problem_of(HEPTAGON)
+
+
+@pytest.fixture(scope="session")
+def box_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from shipped import box_text
+
+    path = tmp_path_factory.mktemp("box") / "box.toml"
+    path.write_text(box_text(), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="session")
+def box(box_file: Path) -> Problem:
+    """The problem of the README, as a file: one slide of a box."""
+    from wholearm import load
+
+    return load(str(box_file))
 
 
 @pytest.fixture(scope="session")

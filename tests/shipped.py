@@ -57,6 +57,12 @@ def put(path: str, value: object) -> Edit:
     return edit
 
 
+def box_text() -> str:
+    """The problem of the README: one slide of a box."""
+    text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    return text.split("```toml\n")[1].split("```")[0]
+
+
 @once
 def solved(path: Path, objective: str = "time") -> Plan:
     return solve(problem_of(path), objective)

@@ -371,20 +371,7 @@ QUICK: tuple[Case, ...] = (
     *(("list", number) for number in range(4)),
     ("predict", "box_rolling"),
 )
-LONGER: tuple[Case, ...] = (
-    ("plan over time", "heptagon_four_contacts", "effort"),
-    *(("variant", name) for name in ("speed", "weak", "rough", "certified", "rough, over time")),
-    ("goal", 34),
-    *(("scene", number, "margin") for number in (17, 44)),
-    ("leg", 24, "time"),
-    ("torques", "heptagon", 0.9),
-    ("map", "square"),
-    ("policy", "heptagon_four_contacts"),
-    ("robustness", "heptagon_four_contacts"),
-    ("report", "heptagon_four_contacts"),
-    ("predict", "triangle"),
-)
-"""More of the same families, which the study of the corpus asks among all others."""
+"""The study of the corpus asks all others, too."""
 REFUSED = ("input", "option", "torque file")
 """Families whose cases cost next to nothing."""
 
@@ -393,12 +380,8 @@ def name(case: Case) -> str:
     return " ".join(map(str, case))
 
 
-@pytest.mark.parametrize("case", [*QUICK, *LONGER], ids=name)
-def test_answers_are_as_stored(
-    case: Case, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if case in LONGER and not request.config.getoption("--slow"):
-        pytest.skip("slow: --slow runs it")
+@pytest.mark.parametrize("case", QUICK, ids=name)
+def test_answers_are_as_stored(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = wholearm.solve
 
     def look_up(problem: Problem, objective: str = "time", **options: Any) -> Plan:

@@ -101,17 +101,11 @@ def test_solve_writes_samples_and_what_becomes_of_them(
     given = ["--intervals", "20", *(["--interpolation", *more] if more else [])]
     command = ["solve", path, "-o", "a.npz", "--torques", "a.csv", "--sample-rate", "200"]
     assert main([*command, *given, "--json"]) == 0
-    plan, table = load_trajectory("a.npz"), wholearm.read_torque_csv("a.csv")
+    plan = load_trajectory("a.npz")
     figures = json.loads(capsys.readouterr().out)["torques"]
     kind = more[0] if more else "linear"
     assert (figures["file"], figures["sample_rate"]) == ("a.csv", 200.0)
     assert figures["interpolation"] == kind
-    t = np.asarray(0.005 * np.arange(int(200 * plan.duration)), dtype=np.float64)
-    middle = table.at(np.asarray(t + 0.0025))
-    samples = plan.torque.at(t + 1e-12)
-    later = plan.torque.at(t + 0.005 + 1e-12)
-    expected = samples if kind == "hold" else (samples + later) / 2
-    np.testing.assert_allclose(middle, expected, atol=1e-9)
     phases = figures["replay"]["phases"]
     assert [row["phase"] for row in phases] == [1, 2]
     planned = [row["planned_arrival"] for row in phases]
@@ -212,50 +206,21 @@ def test_solve_prints_json(
         assert 0.05 < meta["value"] < 1 and sum(meta["phase_durations"]) <= 0.2 * (1 + 1e-6)
 
 
-BAD_PROBLEMS: dict[str, tuple[Edit, str, str]] = {
-    "nan": (put("object.vertices.1.0", float("nan")), "object.vertices[1]", "nan is not a"),
-    "unknown key": (put("object.mas", 1.0), "object.mas", "did you mean 'mass'?"),
-    "later formation": (
-        put("phases.1.contacts.3", "v4-finger2"),
-        "phases[2].contacts",
-        "v4-finger2 does not touch at the end of phase 1",
-    ),
-    "start out of reach": (put("start.x", 0.5), "start", "finger 1 is too short to reach"),
-}
-"""Other values are refused in the tests of the reader."""
-
-
-@pytest.mark.parametrize("case", BAD_PROBLEMS)
-def test_bad_problems(folder: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
-    edit, key, words = BAD_PROBLEMS[case]
-    path = write_problem(folder, edit)
-    message = fails(capsys, 2, "solve", path, "-o", "a.npz", "--torques", "a.csv")
-    assert message.startswith(f"{path}: {key}: ") and words in message
-    assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
-
-
 @pytest.mark.usefixtures("unadvised")
 @pytest.mark.parametrize(
-    "edit, words",
+    "edit, status, words",
     [
-        (
-            put("epsilon", 50.0),
-            ["phase 1 is infeasible: c_n of v1-palm >= epsilon = 50 N", " at t"],
-        ),
-        (
-            put("fingers.1.torque_limit", 0.01),
-            ["torque limit of finger 1 = 0.01 N m", "short"],
-        ),
-        (put("friction", dict.fromkeys(["palm", "finger1", "finger2"], 1.5)), ["jams at x ="]),
+        (put("epsilon", 50.0), 1, "phase 1 is infeasible: c_n of v1-palm >= epsilon = 50 N is "),
+        (put("object.mas", 1.0), 2, "problem.toml: object.mas: unknown key; did you mean 'mass'?"),
     ],
 )
 def test_problems_without_a_plan(
-    folder: Path, capsys: pytest.CaptureFixture[str], edit: Edit, words: list[str]
+    folder: Path, capsys: pytest.CaptureFixture[str], edit: Edit, status: int, words: str
 ) -> None:
+    """What is said of other ones is in the tests of the reader and of the planner."""
     path = write_problem(folder, edit)
-    coarse = ["--intervals", "10"]
-    message = fails(capsys, 1, "solve", path, "-o", "a.npz", "--torques", "a.csv", *coarse)
-    assert all(word in message for word in words), message
+    options = ["-o", "a.npz", "--torques", "a.csv", "--intervals", "10"]
+    assert words in fails(capsys, status, "solve", path, *options)
     assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
 
 
@@ -319,14 +284,7 @@ def test_output_that_is_a_device(folder: Path) -> None:
             "unrecognized arguments: --speed 3; see wholearm solve --help",
         ),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "'ten' given; allowed are whole numbers"),
-        (["solve", str(HEPTAGON), "--intervals", "5"], "--intervals: 5 given; allowed are whole"),
-        (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),
-        (["solve", str(HEPTAGON), "--duration", "1"], "duration: is for the objective margin"),
         (["solve", str(HEPTAGON), "--time-weight", "nan"], "--time-weight: nan given; allowed are"),
-        (
-            ["solve", str(HEPTAGON), "--certify", "--objective", "margin"],
-            "is for the objective time",
-        ),
         (["solve", str(HEPTAGON), "--cache", "found"], "--cache: is for problems with [goal]"),
         (["plot", "a.npz"], "-o/--output"),
         (["verify", str(HEPTAGON), "a.npz", "--tolerance", "0"], "--tolerance: 0.0 given; allowed"),
@@ -363,7 +321,6 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[
     [
         ("a.npz", None, "cannot be read: No such file"),
         ("a.npz", b"", "is not a trajectory file"),
-        ("a.npz", b"nothing like it", "is not a trajectory file"),
         ("a.txt", b"", "ending '.txt' given; allowed: .npz, .csv"),
     ],
 )
@@ -463,16 +420,20 @@ def list_parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParse
     return own + [q for action in inner for p in action.choices.values() for q in list_parsers(p)]
 
 
+def test_every_number_among_the_options_has_a_range() -> None:
+    every = [action for parser in list_parsers(build_parser()) for action in parser._actions]
+    numbers = [action for action in every if action.type is not None]
+    assert len(numbers) > 40
+    for action in numbers:
+        assert callable(action.type) and action.type not in (int, float)
+        for wrong in ("1e300", "1" + 40 * "0", "-1e300", "nan", "inf", "much"):
+            with pytest.raises(argparse.ArgumentTypeError, match="given; allowed are"):
+                action.type(wrong)
+        if isinstance(action.default, int | float):
+            assert action.type(str(action.default)) == action.default
+
+
 def test_help_shows_every_default() -> None:
-    missing = [
-        f"{parser.prog} {action.option_strings[0]}"
-        for parser in list_parsers(build_parser())
-        for action in parser._actions
-        if action.option_strings and action.nargs != 0 and action.type in (int, float)
-        # Those that select something have none, and say in their text what is done without.
-        if "(" not in (action.help or "") and action.dest not in ("only", "restitution")
-    ]
-    assert missing == []
     solve = next(p for p in list_parsers(build_parser()) if p.prog == "wholearm solve")
     known = {action.dest: action.help or "" for action in solve._actions}
     for own in dataclasses.fields(PlanOptions):

@@ -15,26 +15,11 @@ from wholearm.cli.command import main
 from wholearm.design.hand import Design, Hand, design_hand, read_choices
 from wholearm.design.parameters import find_parameter, list_parameters, require_allowed
 
-ROOT = Path(__file__).parents[1]
 UNITS = {
     "": (0, 0, 0), "kg": (0, 1, 0), "m": (1, 0, 0), "N": (1, 1, -2), "N m": (2, 1, -2),
     "N m s": (2, 1, -1), "kg m^2": (2, 1, 0), "m/s^2": (1, 0, -2), "rad/s": (0, 0, -1),
 }  # fmt: skip
 """Exponents of metres, kilograms and seconds."""
-
-
-@pytest.fixture(scope="module")
-def box_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The problem of the README: one slide of a box."""
-    path = tmp_path_factory.mktemp("box") / "box.toml"
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    path.write_text(re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)[0], encoding="utf-8")
-    return path
-
-
-@pytest.fixture(scope="module")
-def box(box_file: Path) -> Problem:
-    return wholearm.load(str(box_file))
 
 
 def test_parameters_are_all_numbers_by_their_shortest_names(box: Problem) -> None:

@@ -7,8 +7,6 @@ import inspect
 import pkgutil
 import re
 import shlex
-import subprocess
-import sys
 import tomllib
 from collections.abc import Callable
 from functools import cache
@@ -71,14 +69,6 @@ def test_the_places_to_look_are_there() -> None:
             assert re.search(rf"(def|class) {name}\b", text), name
 
 
-def run(code: str) -> list[str]:
-    """What a fresh interpreter prints, line by line."""
-    result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
-    )
-    return result.stdout.splitlines()
-
-
 def test_every_name_is_there() -> None:
     for name in wholearm.__all__:
         assert getattr(wholearm, name) is not None, name
@@ -99,14 +89,6 @@ def test_a_function_is_not_shadowed_by_its_module() -> None:
     assert not beside & {*wholearm.__all__}
     kinds = [type(getattr(wholearm, name)) for name in ("verify", "simulate", "plots", "solve")]
     assert kinds == [FunctionType, FunctionType, ModuleType, FunctionType]
-
-
-def test_import_is_lazy() -> None:
-    (loaded,) = run(
-        "import sys, wholearm; "
-        "print([m for m in ('casadi', 'numpy', 'scipy', 'matplotlib') if m in sys.modules])"
-    )
-    assert loaded == "[]"
 
 
 PAGES = [ROOT / "README.md", *sorted(SOURCE.rglob("README.md"))]
@@ -272,12 +254,11 @@ def test_results_are_one_line_and_motions_a_picture() -> None:
     assert "<svg" in plan._repr_html_() and "<svg" in chart()._repr_html_()
 
 
-def test_problem_files_are_toml_and_that_of_the_readme_plans(tmp_path: Path) -> None:
+def test_problem_files_are_toml_and_that_of_the_readme_plans(box: Problem) -> None:
     for path in EVERY:
         for block in list_blocks(path, "toml"):
             assert tomllib.loads(block)
-    (tmp_path / "box.toml").write_text(list_blocks(PAGES[0], "toml")[0], encoding="utf-8")
-    assert wholearm.solve(wholearm.load(str(tmp_path / "box.toml"))).replay is not None
+    assert wholearm.solve(box).replay is not None
 
 
 def name_anchor(heading: str) -> str:

@@ -6,7 +6,8 @@ import dataclasses
 import json
 import math
 import re
-from functools import cache, lru_cache
+import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from scipy.optimize import linprog
 import wholearm
 from planned import change, plan
 from scenes import box, constant, tipped
-from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, text_of
+from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, box_text, problem_of, text_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.analysis.slow_speeds import (
     OWN,
@@ -37,7 +38,7 @@ from wholearm.figures import plots
 from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.mechanics.dynamics import force_rows
 from wholearm.mechanics.limits import force_limit_rows
-from wholearm.problem.read import name_keys
+from wholearm.problem.read import build_problem, name_keys
 from wholearm.problem.table import change_table
 from wholearm.results.adopt import describe_origin, save
 from wholearm.results.report import Loss, Report
@@ -229,30 +230,15 @@ def test_without_quasistatic_torques_the_table_is_printed(
     assert not table.exists()
 
 
-def build_box() -> wholearm.Problem:
-    """A box that two light fingers slide 10 mm to the left."""
-    link: dict[str, Any] = {
-        "length": 0.11,
-        "radius": 0.0,
-        "inertia": 1e-4,
-        "viscous": 0.0,
-        "dry": 0.0,
-        "torque_limit": 1.0,
-    }
-    scene = wholearm.Scene(
-        wholearm.Polygon([[-0.03, 0.0], [0.03, 0.0], [0.03, 0.06], [-0.03, 0.06]], mass=0.2),
-        (wholearm.Finger(base=(0.1, -0.01), **link), wholearm.Finger(base=(-0.1, -0.01), **link)),
-        wholearm.Friction(palm=0.1, finger1=0.1, finger2=0.1),
-    )
-    contacts = wholearm.read_formation(scene, ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"])
-    slide = wholearm.Phase(0, contacts, wholearm.read_until(scene, {"x": -0.01}))
-    start = wholearm.place_start(scene, flush=0, x=0.0)
-    return wholearm.Problem("box", scene, 0.05, start, (slide,))
+@cache
+def light_box() -> Problem:
+    """The box of the README, with weaker fingers."""
+    return build_problem(tomllib.loads(box_text())).with_(torque_limit=1.0)
 
 
-@lru_cache
+@cache
 def tune_box() -> wholearm.Tuning:
-    return wholearm.tune(build_box(), brake=True)
+    return wholearm.tune(light_box(), brake=True)
 
 
 def test_tuned_torques_hold_every_contact_and_end_at_rest() -> None:
@@ -293,7 +279,7 @@ def test_the_table_is_what_was_judged(tmp_path: Path) -> None:
 
 
 def test_constant_torques_do_not_come_to_rest() -> None:
-    found = wholearm.tune(build_box())
+    found = wholearm.tune(light_box())
     assert not found.ok and found.exit_status == 1 and found.torque is None
     assert found.reason.startswith("phase 1: x = -0.01 m is reached at ")
     with pytest.raises(ValueError, match="no torques"):
@@ -312,12 +298,12 @@ def test_constant_torques_do_not_come_to_rest() -> None:
 )
 def test_options_out_of_range_are_refused(given: dict[str, Any], wrong: str) -> None:
     with pytest.raises(InputError, match=wrong):
-        wholearm.tune(build_box(), **given)
+        wholearm.tune(light_box(), **given)
 
 
 def test_stops_are_no_more_than_allowed() -> None:
     """Fingers too weak to move the box: each part is tried once, none is carried."""
-    stuck = build_box().with_(friction_palm=0.9, torque_limit=0.05)
+    stuck = light_box().with_(friction_palm=0.9, torque_limit=0.05)
     alone = wholearm.tune(stuck, brake=True)
     found = wholearm.tune(stuck, brake=True, stops=3)
     assert not alone.ok and not found.ok and "phase 1" in found.reason

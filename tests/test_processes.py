@@ -218,6 +218,7 @@ def test_a_process_that_is_killed_loses_and_doubles_no_task(tmp_path: Path) -> N
     assert not multiprocessing.active_children()
 
 
+PIPES: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
 
 
@@ -366,9 +367,8 @@ sys.exit(guard(lambda: write_whole(sys.argv[1], write) or 0))
 @BOTH
 def test_a_command_that_goes_on_is_ended(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", SWALLOWS, str(tmp_path / "out")]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
-        assert process.stdout.readline() == "ready\n"
+    with subprocess.Popen(command, **PIPES) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
         assert len(os.listdir(tmp_path)) == 1
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
@@ -385,10 +385,9 @@ STARTED = "import wholearm.__main__ as m; print('ready', flush=True); m.run()"
 def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
     given = ["solve", str(HEPTAGON), "--intervals", "800", "--objective", "margin"]
     command = [sys.executable, "-c", STARTED, *given, "-o", "plan.npz", "--torques", "plan.csv"]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": tmp_path}
-    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
+    with subprocess.Popen(command, cwd=tmp_path, **PIPES) as process:
         # Before the interpreter is up nobody can catch a signal.
-        assert process.stdout.readline() == "ready\n"
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
         time.sleep(delay)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
@@ -414,10 +413,9 @@ m.run()
 
 @pytest.mark.parametrize("then", ["pass", "raise OSError('full')", "return 2"])
 def test_workers_end_with_their_command(then: str, tmp_path: Path) -> None:
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     command = [sys.executable, "-c", WORKS.format(then=then)]
-    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
-        assert process.stdout.readline() == "ready\n"
+    with subprocess.Popen(command, **PIPES) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
         # A terminal and `timeout` may send it twice.
         for _ in range(2 * (then == "pass")):
             process.send_signal(signal.SIGINT)

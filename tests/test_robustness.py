@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -118,36 +117,6 @@ def test_what_is_far_off_loses_contacts_and_misses(trial: Trial) -> None:
 def test_a_hand_that_cannot_close_is_counted(trial: Trial) -> None:
     record = trial.change({"base1_x": 1.0})
     assert record["lost"] == "start" and "finger 1" in record["ended"] and not record["reached"]
-
-
-def test_a_study_that_was_stopped_ends_the_same(
-    problem: Problem, plan: Plan, study: Robustness, written: Path, tmp_path: Path
-) -> None:
-    path, calls = tmp_path / "part.jsonl", list[str]()
-    lines = written.read_text().splitlines(keepends=True)
-    assert len(lines) == 7
-    path.write_text("".join(lines[:5]) + lines[5][:20])
-    again = assess_robustness(
-        problem, plan, samples=5, uncertainty=FEW, path=path, start=THREADS, progress=calls.append
-    )
-    assert len(calls) == 2 and calls[-1].startswith("5 of 5 samples")
-    numbers = [json.loads(line)["sample"] for line in path.read_text().splitlines()[2:]]
-    assert sorted(numbers) == list(range(5))
-    assert again.records == study.records
-
-
-def test_another_range_is_another_study(problem: Problem, plan: Plan, tmp_path: Path) -> None:
-    path, calls = tmp_path / "study.jsonl", list[str]()
-    run = partial(assess_robustness, problem, plan, samples=1, path=path, start=THREADS)
-    run(uncertainty=FEW)
-    before, other = path.read_text(), Uncertainty({**FEW.widths, "mass": 0.01}, None)
-    with pytest.raises(InputError, match=r"widths.mass \(0.05 in the file, 0.01 now\)"):
-        run(uncertainty=other)
-    with pytest.raises(InputError, match=r"seed \(0 in the file, 1 now\)"):
-        run(uncertainty=FEW, seed=1)
-    assert path.read_text() == before
-    run(uncertainty=other, fresh=True, progress=calls.append)
-    assert len(calls) == 1
 
 
 def test_a_study_grows_and_is_reported_in_part(

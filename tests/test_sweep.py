@@ -21,17 +21,7 @@ from wholearm.design.sweep import Planner, describe_failure, read_vary, sweep
 from wholearm.problem.definition import Goal
 
 ONE: Callable[[], Executor] = partial(ThreadPoolExecutor, 1)
-README = Path(__file__).parents[1] / "README.md"
 GRID = {"torque_limit": [0.02, 1.0, 2.0], "mass": [0.2, 0.25]}
-
-
-@pytest.fixture(scope="module")
-def box(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    """The problem of the README: one slide of a box."""
-    path = tmp_path_factory.mktemp("box") / "box.toml"
-    (text,) = re.findall(r"^```toml\n(.*?)^```", README.read_text(encoding="utf-8"), re.M | re.S)
-    path.write_text(text, encoding="utf-8")
-    return wholearm.load(str(path))
 
 
 @pytest.fixture(scope="module")
