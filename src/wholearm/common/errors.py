@@ -195,6 +195,14 @@ def require_number(
     return result
 
 
+def suggest(name: str, known: Iterable[str]) -> str:
+    """The name that is meant, as the first words of a hint; empty where none is near."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(name, list(known), 1, 0.5)
+    return f"did you mean {near[0]!r}? " if near else ""
+
+
 def read_share(value: str, key: str) -> float:
     """What a text such as "10 %" says, as a fraction, or raise `InputError` naming `key`."""
     number, sign, rest = value.partition("%")

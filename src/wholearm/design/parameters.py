@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from typing import Any, NamedTuple
 
-from ..common.errors import InputError
+from ..common.errors import InputError, suggest
 from ..common.fields import POINT, Field
 from ..problem.definition import Problem
 from ..problem.read import FINGER, FRICTION, OBJECT, START, TOP, UNTIL, name_keys
@@ -67,11 +66,9 @@ def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
     every = _find_every(problem)
     if name in every:
         return every[name]
-    near = get_close_matches(name, every, 1, 0.5)
-    hint = f"did you mean {near[0]!r}? " if near else ""
     shown = [p.name for p in list_parameters(problem) if not p.name.startswith("object.")]
-    text = f"no number of this problem has that name; {hint}it has {', '.join(shown)}"
-    raise InputError(problem.source, f"{label} {name}".strip(), text)
+    text = f"no number of this problem has that name; {suggest(name, every)}it has "
+    raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(shown))
 
 
 def require_allowed(problem: Problem, parameter: Parameter, value: float, label: str) -> None:

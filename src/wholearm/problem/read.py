@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source, require_number, require_vector
+from ..common.errors import InputError, name_source, require_number, require_vector, suggest
 from ..common.fields import (
     NONNEGATIVE,
     NUMBER,
@@ -347,12 +347,8 @@ def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
     prefix = f"{where}." if where else ""
     for key in table:
         if key not in known:
-            from difflib import get_close_matches
-
-            near = get_close_matches(key, known, 1, 0.5)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            allowed = ", ".join(sorted(known))
-            raise InputError("", f"{prefix}{key}", f"unknown key; {hint}allowed are {allowed}")
+            allowed = f"allowed are {', '.join(sorted(known))}"
+            raise InputError("", f"{prefix}{key}", f"unknown key; {suggest(key, known)}{allowed}")
     for key in sorted(name for name, field in known.items() if field.required):
         if key not in table:
             raise InputError("", f"{prefix}{key}", "is missing")

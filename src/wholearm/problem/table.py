@@ -8,12 +8,11 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.errors import InputError
+from ..common.errors import InputError, suggest
 from ..common.fields import Field, keys_of
 from ..common.files import require_ending, write_text
 from ..contacts.closing import close_finger, place_flush
@@ -47,10 +46,8 @@ def change_table(
     for name, value in changes.items():
         dotted = "." in name or "[" in name
         if not dotted and name not in names:
-            near = get_close_matches(name, names, 1, 0.5)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            text = f"unknown name; {hint}allowed are {', '.join(sorted(names))}"
-            raise InputError("", name, text)
+            allowed = f"allowed are {', '.join(sorted(names))}"
+            raise InputError("", name, f"unknown name; {suggest(name, names)}{allowed}")
         whole = name == "friction" and isinstance(value, Mapping)
         for key in (name,) if dotted or whole else names[name]:
             _set(changed, key, _to_plain(value))
@@ -82,9 +79,8 @@ def _enter(place: Any, step: str | int, key: str) -> Any:
             raise InputError("", key, f"there is no number {step + 1}; the list has {count}")
     elif not isinstance(place, dict) or step not in place:
         keys = list(place) if isinstance(place, dict) else ["no table"]
-        near = get_close_matches(step, keys, 1, 0.5)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise InputError("", key, f"there is no {step!r}; {hint}what is there: {', '.join(keys)}")
+        there = f"what is there: {', '.join(keys)}"
+        raise InputError("", key, f"there is no {step!r}; {suggest(step, keys)}{there}")
     return place[step]
 
 

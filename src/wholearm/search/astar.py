@@ -46,7 +46,6 @@ OFTEN = 2  # expansions of one place, on different routes
 MOST = 4000  # most entries that are taken from the queue
 FINEST = 0.03  # finest step of the place where a border is left, over the border's length
 STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
-ELSEWHERE = (0.15, -0.15)  # shifts of the place, over that length, if there is no plan from it
 GAIN = 0.998  # largest ratio of durations that counts as a gain
 INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
@@ -275,7 +274,6 @@ class RoutePlanner:
     found: list[Route] = field(default_factory=list)  # their edges through cells have plans
     made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
-    _prefetched: dict[Edge, CoarsePlan | None] = field(default_factory=dict)
     _measurements: int = 0
     _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
@@ -420,21 +418,17 @@ class RoutePlanner:
         """Plan the edges of a route that lead through cells; whether all have a plan."""
         if self._is_lost(route):
             return False
-        plans, kept = self.roadmap.coarse_plans, self._prefetched
+        plans = self.roadmap.coarse_plans
         in_cells = [edge for edge in route.edges if edge.in_cell]
-        new = [edge for edge in in_cells if edge not in plans and edge not in kept]
-        if self.jobs > 1 and len(new) > 1:
-            tasks = [partial(self._plan_coarsely, edge) for edge in new]
-            kept.update(zip(new, self._share(tasks), strict=True))
-        for edge in in_cells:
-            if edge not in plans:
-                self._measurements += 1
-                report(f"planning {describe_steps(edge.steps)}")
-                plan = kept.pop(edge) if edge in kept else self._plan_coarsely(edge)
-                plans[edge] = [plan] if plan else []
-            if not plans[edge]:
-                return False
-        return True
+        new = [edge for edge in in_cells if edge not in plans]
+        self._measurements += len(new)
+        if new:
+            report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
+        plan = partial(plan_coarsely, self.problem, options=self.options, further=True)
+        tasks = [partial(plan, edge, edge.steps) for edge in new]
+        for edge, coarse in zip(new, self._share(tasks), strict=True):
+            plans[edge] = [coarse] if coarse else []
+        return all(plans[edge] for edge in in_cells)
 
     def _refine(self, route: Route, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
@@ -459,15 +453,6 @@ class RoutePlanner:
 
     def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene))
-
-    def _plan_coarsely(self, edge: Edge) -> CoarsePlan | None:
-        """Plan an edge through a cell, from other places of its border if that fails."""
-        plan = plan_coarsely(self.problem, edge, edge.steps, self.options, further=True)
-        for move in ELSEWHERE if edge.left else ():
-            place = edge.share + move
-            if plan is None and INSIDE < place < 1 - INSIDE:
-                plan = plan_coarsely(self.problem, edge, leave_at(edge, place), self.options)
-        return plan
 
     def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> CoarsePlan | None:
         """Plan an edge that leaves its border at another place, or in motion."""

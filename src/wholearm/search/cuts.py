@@ -278,22 +278,17 @@ def list_hands(scene: Scene) -> list[Change]:
     """Lengths and bases of the fingers that are tried: of both alike where they are, by size."""
     right, left = scene.fingers
     (first, _), (second, _) = np.asarray(right.base).tolist(), np.asarray(left.base).tolist()
-    half, base = (first - second) / 2, "fingers.{}.base[1]"
+    half, keys = (first - second) / 2, ("fingers.1.base[1]", "fingers.2.base[1]")
     numbers: list[tuple[str, float, float, tuple[str, ...]]]
     # Bases first: they have decided more often than lengths.
+    numbers = [("x of base 1", first, half, keys[:1]), ("x of base 2", second, -half, keys[1:])]
     if math.isclose(first, -second, rel_tol=SYMMETRIC):
-        keys = base.format(1), base.format(2)
         numbers = [("x of base 1, mirrored for base 2,", first, half, keys)]
-    else:
-        numbers = [
-            ("x of base 1", first, half, (base.format(1),)),
-            ("x of base 2", second, -half, (base.format(2),)),
-        ]
     if math.isclose(right.length, left.length, rel_tol=SYMMETRIC):
         numbers.append(("length of both fingers", right.length, right.length, ("length",)))
     else:
-        numbers.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
-        numbers.append(("length of finger 2", left.length, left.length, ("fingers.2.length",)))
+        for k, length in ((1, right.length), (2, left.length)):
+            numbers.append((f"length of finger {k}", length, length, (f"fingers.{k}.length",)))
     return [
         Change(Parameter(name, value, "m", 1 if scale > 1 else -1, *keys), float(f"{moved:.3g}"))
         for scale in HANDS
