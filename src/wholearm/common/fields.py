@@ -98,13 +98,14 @@ class Range:
         if scale is None:
             return
         low, high = self.low * scale, self.high * scale
-        time = f"{scene.scales.time:.3g} s" if scene is not None else ""
         several = hasattr(given, "__len__") and not isinstance(given, str)
         for value in given if several else (given,):
             counts = isinstance(value, Real) and value and math.isfinite(value)
             # A scale is rounded: in other units a number at its bound may be past it by that.
             slack = 1e-12 * abs(value) if counts and self.scale is not None else 0.0
             if counts and not low - slack <= value <= high + slack:
+                # Units of a scene with such a number may not exist.
+                time = f"{scene.scales.time:.3g} s" if "{time}" in self.of else ""
                 what = f" ({self.describe(time)})" if self.of else ""
                 text = f"{low:.3g} to {high:.3g} {unit}".rstrip()
                 raise InputError("", key, f"{value:g} given; allowed are {text}{what}")
