@@ -238,7 +238,7 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
     problem = build_problem(tomllib.loads(text))
     plan = wholearm.solve(problem, replay=False).trajectory
     policy = make_policy(problem, plan)
-    assert [law.count for law in policy.laws] == [1, 3]
+    assert [len(law.starts) for law in policy.laws] == [1, 3]
     policy.save(tmp_path / "policy.npz")
     report = verify_policy(problem, plan, Policy.load(tmp_path / "policy.npz"))
     assert report.ok, report.failures

@@ -118,11 +118,6 @@ class CurveLaw:
         self.sensing: Sensing | None = None
         self.begin()
 
-    @property
-    def count(self) -> int:
-        """Number of phases."""
-        return len(self.starts)
-
     def lead_to(self, after: CurveLaw) -> None:
         """Set the next law."""
         if self.passes:
@@ -135,7 +130,7 @@ class CurveLaw:
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
-        self.passed = self.count - 1 if at_end else 0
+        self.passed = len(self.starts) - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
@@ -147,7 +142,7 @@ class CurveLaw:
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
     ) -> tuple[float, float]:
         """Torques for joint angles and speeds [N m]."""
-        self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
+        self._measure(theta, rates)
         settings, s, v, j = self.settings, self.s, self.v, self.j
         if self.pushes:
             return self._press(theta, rates)
@@ -190,14 +185,14 @@ class CurveLaw:
 
     def hold(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that press this law's contacts and bring the joints to rest [N m]."""
-        self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
+        self._measure(theta, rates)
         v = self.v + (self.settings.delay + 0.5 * self.settings.period) * self.a
         j, share = self._locate(self.j, self.s)
         return self._act(j, share, v, 0.0, -self.gain * v)
 
     def slow_down(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that bring the joints to rest, without those that press contacts [N m]."""
-        self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
+        self._measure(theta, rates)
         j, share = self._locate(self.j, self.s)
         rows = zip(self.torque[j], self.torque_rises[j], strict=True)
         one, two = (before[3] + share * rise[3] for before, rise in rows)
@@ -218,9 +213,9 @@ class CurveLaw:
             self.drive = 0.0
         return self.drive > rise or self.s > self.length + self.beyond
 
-    def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
+    def _measure(self, theta: Sequence[float], rates: Sequence[float]) -> None:
         """Place and speed: the joints' projection on the chords next to the last one."""
-        j, last, sign = self.j, len(self.chords) - 1, 0
+        one, two, j, last, sign = float(theta[0]), float(theta[1]), self.j, len(self.chords) - 1, 0
         while True:
             node, (e, f), square = self.theta[j], self.chords[j], self.squares[j]
             share = ((one - node[0]) * e + (two - node[1]) * f) / square
@@ -234,8 +229,8 @@ class CurveLaw:
         self.j, self.s = j, self.nodes[j] + share * self.steps[j]
         (e, f), (g, h), share = self.slopes[j], self.slopes[j + 1], min(max(share, 0.0), 1.0)
         e, f = e + share * (g - e), f + share * (h - f)
-        self.v = (rate_one * e + rate_two * f) / (e * e + f * f or 1e-30)
-        while self.passed + 1 < self.count and self.s >= self.starts[self.passed + 1]:
+        self.v = (float(rates[0]) * e + float(rates[1]) * f) / (e * e + f * f or 1e-30)
+        while self.passed + 1 < len(self.starts) and self.s >= self.starts[self.passed + 1]:
             self.passed += 1
 
     def _has_turned(self, rates: Sequence[float]) -> bool:
@@ -266,12 +261,10 @@ class CurveLaw:
         """Level on each interval below which feedback is reduced."""
         floors = []
         for j, h in enumerate(self.steps):
-            b, after = self.b[j], self.b[j + 1]
-            a, level = (after - b) / (2 * h), 1e30
-            for share, b_end in ((0.0, b), (1.0, after)):
-                level = min(
-                    level, choose_internal_force(*self._list_levels(j, share, sqrt(b_end)), a)[0]
-                )
+            ends = self.b[j : j + 2]
+            a = (ends[1] - ends[0]) / (2 * h)
+            rows = [self._list_levels(j, k, sqrt(b)) for k, b in enumerate(ends)]
+            level = min(choose_internal_force(*each, a)[0] for each in rows)
             floors.append(min(LAW.level, LAW.part * level))
         return floors
 
@@ -344,22 +337,18 @@ class CurveLaw:
 
 
 def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows]]:
-    """Rows at the start of each interval and their differences, without ignored ones."""
-    table = _clear_rounding(table)
+    """Rows at the start of each interval and their differences, without ignored ones.
+
+    Coefficients of the internal force that are 0 but for rounding are 0.
+    """
+    size, table = abs(table[..., 4]), table.copy()
+    table[..., 4][size <= 1e-9 * size.max(initial=0.0)] = 0.0
     first, rises = table[:, 0], table[:, 1] - table[:, 0]
     if most is None:
         return first.tolist(), rises.tolist()
     counts = table[:, :, :, 0].min(axis=1) < most
     kept = [[r[k].tolist() for r, k in zip(a, counts, strict=True)] for a in (first, rises)]
     return kept[0], kept[1]
-
-
-def _clear_rounding(table: Any) -> Any:
-    """The table with 0 for coefficients of the internal force that are 0 but for rounding."""
-    size = abs(table[..., 4])
-    table = table.copy()
-    table[..., 4][size <= 1e-9 * size.max(initial=0.0)] = 0.0
-    return table
 
 
 class LoopSettings(NamedTuple):
@@ -405,11 +394,6 @@ class MotionLaw:
         # The next law, if along a curve: it presses its contacts before it begins.
         self.after: CurveLaw | None = None
         self.begin()
-
-    @property
-    def count(self) -> int:
-        """Number of phases."""
-        return len(self.starts)
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or at the end."""

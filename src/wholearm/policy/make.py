@@ -46,13 +46,7 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .curve_law import LoopSettings, choose_internal_force
 from .playback import Policy
-from .regulator import (
-    STILL,
-    Planner,
-    hold_end,
-    replan,
-    tabulate_motion,
-)
+from .regulator import STILL, Planner, hold_end, replan, tabulate_motion
 
 COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
 PathMotion = tuple[Array, Array, Array]  # a, b and internal force at n places
@@ -121,8 +115,8 @@ def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
     Speed limits are kept by the plan, and no motion of a policy is faster.
     """
     limits, _ = make_limits(formation, 0.0).split_speeds()
-    contact = [limit for limit in limits.limits if limit.rows[:, :-4].any()]
-    joint = [limit for limit in limits.limits if not limit.rows[:, :-4].any()]
+    pairs = [(limit, limit.rows[:, :-4].any()) for limit in limits.limits]
+    contact, joint = ([limit for limit, own in pairs if own == kind] for kind in (True, False))
     return LimitSet(tuple(contact)), LimitSet(tuple(joint))
 
 
@@ -172,9 +166,8 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     slack[1][have_same_signs(*sides)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
     unit.append(np.tile(SETTINGS.spare * joint.scales[joint.sides[0]], (len(s), 1)))
-    table, count = np.concatenate(slack, axis=1), 2 * slack[0].shape[1]
-    units = np.concatenate(unit, axis=1)
-    return CurveLimitRows(s, torque, table, units, count)
+    tables = (np.concatenate(parts, axis=1) for parts in (slack, unit))
+    return CurveLimitRows(s, torque, *tables, 2 * slack[0].shape[1])
 
 
 def have_same_signs(before: Directions, after: Directions) -> Array:
@@ -198,15 +191,6 @@ def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
     pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
     return np.array([choose_internal_force(one, [0.0] * len(one), by, 0.0)[1] for one, by in pairs])
-
-
-def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
-    """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
-    formation, point = curve.formation, curve.evaluate(s)
-    mean = blend_directions(curve, s, speed * SETTINGS.near)[0]
-    forces = inverse(formation, *point[:3], mean, point.kinematics)
-    c_n = forces.of_c[:, : formation.n_contacts]
-    return np.stack([c_n[:-1], c_n[1:]], axis=1)
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
@@ -307,19 +291,15 @@ class Within(NamedTuple):
         motions = self._spread(motion)
         forces = self._pick(self.sides, motions)
         closed = self._pick([side.close(self.left) for side in self.sides], motions)
-        count, n = len(self.unit) - self.left.shape[1], len(self.s)
         slack = np.concatenate([forces, self.left], axis=1)
-        copies = forces.shape[1] // count
-        unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
-        table, presses = np.tile(unit, (n, 1)), forces.shape[1]
-        rows = CurveLimitRows(self.s, self.torque, slack, table, presses)
-        kept = np.concatenate(
-            [SETTINGS.kept * self.unit[:count], SETTINGS.authority * self.unit[count:]]
-        )
-        again = np.tile(kept, 2 * len(motions))
-        wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
-        whole = np.concatenate([slack, closed], axis=1)
-        return rows, whole, np.tile(wanted, (n, 1))
+        press, drive = np.split(self.unit, [-self.left.shape[1]])
+        copies, n = forces.shape[1] // len(press), len(self.s)
+        table = np.tile(np.append(np.tile(press, copies), drive), (n, 1))
+        rows = CurveLimitRows(self.s, self.torque, slack, table, forces.shape[1])
+        press, drive = SETTINGS.kept * press, SETTINGS.authority * drive
+        again = np.tile(np.append(press, drive), 2 * len(motions))
+        wanted = np.concatenate([np.tile(press, copies), drive, again])
+        return rows, np.concatenate([slack, closed], axis=1), np.tile(wanted, (n, 1))
 
     def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[PathMotion]) -> Array:
         """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
@@ -407,10 +387,10 @@ def trace_pieces(
     """
     pieces: dict[int, ReferencePiece] = {}
     for block in filter(runs_on_curves, split_blocks(problem)):
+        before: ReferencePiece | None = None
         after: ReferencePiece | None = None
         for phase in reversed(block):
             after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, after)
-        before: ReferencePiece | None = None
         for phase in block:
             piece = pieces[phase.index]
             first = float(piece.reach.high[0])
@@ -577,22 +557,26 @@ def _follow(
     return s, a, v**2, np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA])
 
 
-def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
-    """Arrays of `CurveLaw`."""
-    rows, levels = piece.rows, piece.rows.levels
-    dry = phase.formation.scene.dry[3:]
+def _tabulate_curve(piece: ReferencePiece, push: Array) -> dict[str, Array]:
+    """Arrays of `CurveLaw`; levels, torques and normal forces are at both ends of intervals."""
+    rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
+    point, dry = curve.evaluate(rows.s), formation.scene.dry[3:]
+    mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
+    c_n = inverse(formation, *point[:3], mean, point.kinematics).of_c[:, : formation.n_contacts]
+    tables = rows.levels, rows.torque, c_n
+    levels, torque, forces = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
     return {
         "starts": np.zeros(1),
         "s": rows.s,
-        "theta": piece.curve.evaluate(rows.s).z[:, 3:],
+        "theta": point.z[:, 3:],
         "b": piece.b,
-        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1))[..., COLUMNS],
-        "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1)[..., COLUMNS],
+        "levels": leave_one(levels)[..., COLUMNS],
+        "torque": torque[..., COLUMNS],
         "push": push,
         "passes": np.array([piece.passes]),
         # Friction of the joints decides on rest where torques are not much larger.
         "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
-        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
+        "forces": forces[..., COLUMNS],
     }
 
 
@@ -689,7 +673,7 @@ def make_policy(
             if not np.isnan(plan.c_n[last]).all():
                 hold = hold_end(problem, phase, piece.curve.end)
                 push = push if hold is None else hold
-            table = _tabulate_curve(piece, phase, push)
+            table = _tabulate_curve(piece, push)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = bool(piece.passes) and phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)

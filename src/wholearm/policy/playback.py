@@ -84,13 +84,13 @@ class Policy(Result):
                 law.after = after
         self.sensor = sensor
         self.last = len(self.laws) - 1 if laws is None else laws - 1
-        counts = [law.count for law in self.laws[: self.last + 1]]
+        counts = [len(law.starts) for law in self.laws[: self.last + 1]]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
         # Laws along curves with known contacts use measured forces.
         contacts = dict[str, None]()
         phases = self.about.get("phases", [])
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
-            entries = phases[first - 1 : first - 1 + law.count]
+            entries = phases[first - 1 : first - 1 + len(law.starts)]
             names = [list(entry.get("reserves", {})) for entry in entries]
             table = arrays.get("forces", np.zeros((0, 2, 0, 5)))
             if isinstance(law, CurveLaw) and {len(each) for each in names} == {table.shape[2]}:
@@ -134,7 +134,7 @@ class Policy(Result):
     @property
     def count(self) -> int:
         """Number of phases."""
-        return sum(law.count for law in self.laws[: self.last + 1])
+        return sum(len(law.starts) for law in self.laws[: self.last + 1])
 
     @property
     def phase(self) -> int:
@@ -250,15 +250,12 @@ def _read_meta(source: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
     if not valid:
         raise InputError(source, "meta", "is not that of a policy; `wholearm policy` writes them")
     try:
-        one, two = settings.pop("limit")
-        for key in settings:
+        limits = [require_number(limit, "limit", positive=True) for limit in settings.pop("limit")]
+        for key, value in settings.items():
             positive = key == "period"
-            value = require_number(settings[key], key, positive=positive, nonnegative=not positive)
-            settings[key] = value
-        settings["limit"] = (
-            require_number(one, "limit", positive=True),
-            require_number(two, "limit", positive=True),
-        )
+            settings[key] = require_number(value, key, positive=positive, nonnegative=not positive)
+        one, two = limits
+        settings["limit"] = one, two
     except (TypeError, ValueError):
         raise InputError(source, "meta.pace.limit", "is not two numbers") from None
     except InputError as error:

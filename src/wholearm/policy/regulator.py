@@ -286,9 +286,8 @@ def tabulate_motion(
 def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
     """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
     both = phase.formation.add(phase.until.contact)
+    left = _span(both, both.evaluate(z, np.zeros_like(z)).P)[0].T
     units = np.sqrt(metric_weights(problem.scene))
-    P = both.evaluate(z, np.zeros_like(z)).P[0] / units
-    left = np.linalg.svd(P)[2][len(P) :] / units
     basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
     return np.asarray(basis.T[sizes > 1e-3 / units[3]])
 
@@ -314,10 +313,7 @@ def list_phases(plan: Trajectory) -> list[PlannedPhase]:
     """The phases of a plan."""
     torques = [plan.torque.cut(*span) for span in pairwise(plan.phase_starts.tolist())]
     torques = [replace(torque, breaks=torque.breaks - torque.breaks[0]) for torque in torques]
-    return [
-        PlannedPhase(*phase)
-        for phase in zip(plan.motions, torques, plan.meta["modes"], strict=True)
-    ]
+    return list(map(PlannedPhase, plan.motions, torques, plan.meta["modes"]))
 
 
 def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Problem, Trajectory]:
@@ -353,10 +349,8 @@ def _stop(
         return [block]
     if not first.until.is_release or first.formation.n_constraints != 4:
         return []
-    start, end = (
-        plan.z[np.flatnonzero(plan.phase == phase.index)[row]]
-        for phase, row in ((first, 0), (block[-1], -1))
-    )
+    rows = (plan.phase >= first.index) & (plan.phase <= block[-1].index)
+    start, end = plan.z[rows][[0, -1]]
     name = "phi" if abs(end[2] - start[2]) > SAME else "x"
     row = ROWS[name]
     value = float(start[row] + share * (end[row] - start[row]))
@@ -403,10 +397,8 @@ def _solve(
     planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
 ) -> Trajectory | None:
     """Plan of phases from a configuration at rest, with a share of the margin."""
-    scene = problem.scene
-    one, two = (
-        replace(link, torque_limit=(1 - share * ROOM) * link.torque_limit) for link in scene.fingers
-    )
+    scene, ease = problem.scene, 1 - share * ROOM
+    one, two = (replace(f, torque_limit=ease * f.torque_limit) for f in scene.fingers)
     tightened = replace(
         problem,
         start=z,

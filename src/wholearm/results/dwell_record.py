@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..scene.model import Scene
 from .torque import TorqueProfile
-from .trajectory import Motion, Samples, Trajectory
+from .trajectory import Motion, Samples, Trajectory, split_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,17 +224,12 @@ def assemble(
     z, z_dot, z_ddot, tau = (np.concatenate([row[k] for row in rows]) for k in range(4))
     c_n, c_t = np.concatenate(forces, axis=1)
     return Trajectory(
+        **split_motion(z, z_dot, z_ddot),
         t=np.concatenate(times),
-        q=z[:, :3],
-        theta=z[:, 3:],
-        q_dot=z_dot[:, :3],
-        theta_dot=z_dot[:, 3:],
-        q_ddot=z_ddot[:, :3],
-        theta_ddot=z_ddot[:, 3:],
         tau=tau,
-        contacts=contacts,
         c_n=c_n,
         c_t=c_t,
+        contacts=contacts,
         phase=np.repeat(np.arange(len(motions)), [len(row.z) for row in rows]),
         torque=torque,
         motions=tuple(motions),

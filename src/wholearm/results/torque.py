@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -61,6 +61,12 @@ class TorqueProfile:
         """Torques at places `x`, shape (n,) in [-1, 1], of every piece, as (k, 2, n) [N m]."""
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
         return np.asarray(self.coefficients @ powers.T)
+
+    @property
+    def jumps(self) -> Array:
+        """By how much the torques step at each break but the ends, shape (k - 1, 2) [N m]."""
+        signs = (-1.0) ** np.arange(self.coefficients.shape[2])
+        return np.asarray(self.coefficients[1:] @ signs - self.coefficients[:-1].sum(axis=2))
 
     def integrate_squares(self) -> float:
         """Integral of tau^T tau over all pieces [(N m)^2 s]."""
@@ -149,7 +155,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
             raise InputError(
                 str(path), column, f"column is missing; {names} given, {','.join(COLUMNS)} needed"
             )
-    where = [header.index(column) for column in COLUMNS]
+    where = {column: header.index(column) for column in COLUMNS}
     values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])
     if len(values) < 2:
         raise InputError(str(path), "t", f"{len(values)} rows given; two or more are needed")
@@ -189,9 +195,9 @@ def _open(path: str) -> Iterator[TextIO]:
         raise InputError(str(path), "", f"is not CSV: {error}") from None
 
 
-def _read_row(path: str, line: int, row: list[str], where: list[int]) -> list[float]:
+def _read_row(path: str, line: int, row: list[str], where: Mapping[str, int]) -> list[float]:
     values = []
-    for column, index in zip(COLUMNS, where, strict=True):
+    for column, index in where.items():
         text = row[index].strip() if index < len(row) else ""
         try:
             value = float(text)
@@ -200,8 +206,8 @@ def _read_row(path: str, line: int, row: list[str], where: list[int]) -> list[fl
         if not math.isfinite(value):
             raise InputError(str(path), column, f"{text!r} on line {line} is not a finite number")
         if abs(value) > MOST:
-            problem = f"{text} on line {line} given; allowed are -{MOST:g} to {MOST:g}"
-            raise InputError(str(path), column, problem)
+            allowed = f"allowed are -{MOST:g} to {MOST:g}"
+            raise InputError(str(path), column, f"{text} on line {line} given; {allowed}")
         values.append(value)
     return values
 
@@ -225,9 +231,7 @@ def place_rows(
         return np.column_stack([ends, np.zeros((2, 2))])
     knots = _divide(torque, error * largest)
     breaks = torque.breaks
-    alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
-    jump = torque.coefficients[1:] @ alternate - torque.coefficients[:-1].sum(axis=2)
-    steps = breaks[1:-1][np.abs(jump).max(axis=1) > 1e-6 * largest]
+    steps = breaks[1:-1][np.abs(torque.jumps).max(axis=1) > 1e-6 * largest]
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]

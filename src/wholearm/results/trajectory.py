@@ -160,10 +160,8 @@ class Trajectory(Drawn):
         torques below a tenth of the largest cannot be seen.
         """
         profile = self.torque
-        before = profile.coefficients[:-1].sum(axis=2)
-        signs = (-1.0) ** np.arange(profile.coefficients.shape[2])
-        after = (profile.coefficients[1:] * signs).sum(axis=2)
-        stepping = np.abs(after - before).max(axis=1) > 0.1 * np.abs(profile.coefficients).max()
+        least = 0.1 * np.abs(profile.coefficients).max()
+        stepping = np.abs(profile.jumps).max(axis=1) > least
         breaks, starts = profile.breaks[1:-1], self.phase_starts
         inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * self.duration
         t = self.t
@@ -255,6 +253,13 @@ def interpolate_quintic(
     )
 
 
+def split_motion(z: Array, z_dot: Array, z_ddot: Array) -> dict[str, Array]:
+    """Degrees of freedom and their derivatives, (n, 5) each, as a `Trajectory` names its arrays."""
+    pairs = zip(("", "_dot", "_ddot"), (z, z_dot, z_ddot), strict=True)
+    parts = ("q", slice(3)), ("theta", slice(3, 5))
+    return {f"{name}{dots}": of[:, part] for dots, of in pairs for name, part in parts}
+
+
 def sample_phases(
     arrays: Mapping[str, Any], contacts: tuple[str, ...]
 ) -> tuple[SampledMotion, ...]:
@@ -285,9 +290,9 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     source = str(path)
     extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}
     arrays = read_arrays(path, (*_ARRAYS, *extra, "meta"))
-    for name in (*_ARRAYS, *extra, "meta"):
-        if name not in arrays:
-            raise InputError(source, name, "array is missing")
+    missing = next((name for name in (*_ARRAYS, *extra, "meta") if name not in arrays), None)
+    if missing:
+        raise InputError(source, missing, "array is missing")
     for name, shape in (_ARRAYS | extra).items():
         _check_shape(source, name, arrays, shape)
     _check_order(source, arrays)

@@ -15,7 +15,7 @@ from ..common.document import Drawn
 from ..common.errors import SimulationError
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory, sample_phases
+from ..results.trajectory import Trajectory, sample_phases, split_motion
 from .stepper import ModeStepper
 
 
@@ -182,9 +182,7 @@ class Simulation(Drawn):
         rows = np.concatenate(chosen)
         names = ("t", "tau", "c_n", "c_t", "phase")
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
-        for suffix in ("", "_dot", "_ddot"):
-            z = getattr(self, f"z{suffix}")[rows]
-            arrays |= {f"q{suffix}": z[:, :3], f"theta{suffix}": z[:, 3:]}
+        arrays |= split_motion(self.z[rows], self.z_dot[rows], self.z_ddot[rows])
         motions = sample_phases(arrays, self.contacts)
         rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
         meta = {

@@ -109,7 +109,7 @@ class Run(ABC):
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
-        self.steps_at: list[bool] = [True, *self.find_torque_steps(torque.coefficients).tolist()]
+        self.steps_at: list[bool] = [True, *self.find_torque_steps(torque).tolist()]
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
@@ -198,11 +198,9 @@ class Run(ABC):
         start, stop = self.breaks[self.piece : self.piece + 2]
         return (start + stop + x * (stop - start)) / 2
 
-    def find_torque_steps(self, pieces: Array) -> NDArray[np.bool_]:
-        """Whether torques step between successive pieces, (n + 1, 2, d + 1), shape (n,)."""
-        jump = pieces[1:] @ (-1.0) ** np.arange(pieces.shape[2]) - pieces[:-1].sum(axis=2)
-        least = 2e-8 * self.system.scales.torque
-        return np.asarray(np.abs(jump).max(axis=1) > least)
+    def find_torque_steps(self, torque: TorqueProfile) -> NDArray[np.bool_]:
+        """Whether torques step between successive pieces, shape (k - 1,)."""
+        return np.asarray(np.abs(torque.jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
 
     def set_velocity(self, v: Array | float) -> None:
         """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
@@ -259,8 +257,9 @@ class Run(ABC):
             forces = dict(zip(names, last.c_n.tolist(), strict=True))
         self.feedback.begin(self.piece, theta, theta_dot, forces)
         if self.piece:
-            pieces = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-            self.steps_at[self.piece] = bool(self.find_torque_steps(pieces)[0])
+            first, (breaks, pieces) = self.piece - 1, (self.torque.breaks, self.torque.coefficients)
+            pair = TorqueProfile(breaks[first : first + 3], pieces[first : first + 2])
+            self.steps_at[self.piece] = bool(self.find_torque_steps(pair)[0])
 
     def step_to(self, h: float) -> None:
         """Repeat the step with another length."""

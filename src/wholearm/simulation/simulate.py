@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -102,7 +102,7 @@ def simulate(
         require_phases(problem)
         run = Replay(problem, profile, tolerance, wanted, minima)
         return _conclude(run, problem, *run.play(progress))
-    state = _require_start(problem, start)
+    state = _require_start(problem.start if start is None else start)
     if require_number(restitution, "restitution", nonnegative=True) > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     end = None if until is None else require_number(until, "until", positive=True)
@@ -146,22 +146,18 @@ def simulate_phases(
     starts, simulations = plan.phase_starts, []
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
     system = build_system(problem.scene)
-    rests = [system.is_slower(plan.z_dot[row], SLOW) for row in rows] + [True]
-    first = 0
-    for last in range(len(rows)):
-        if not rests[last + 1]:
-            continue
+    rests = [row for row in range(1, len(rows)) if system.is_slower(plan.z_dot[rows[row]], SLOW)]
+    for first, stop in pairwise([0, *rests, len(rows)]):
         if progress is not None:
             progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
-        profile = plan.torque.cut(float(starts[first]), float(starts[last + 1]))
+        profile = plan.torque.cut(float(starts[first]), float(starts[stop]))
         row = rows[first]
         state = np.concatenate([plan.z[row], plan.z_dot[row]])
         hint = _recall(problem, plan, row)
-        clock = starts[first : last + 1].tolist()
+        clock = starts[first:stop].tolist()
         options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
         simulation = _simulate(problem, profile, state, clock, hint, **options)
-        simulations.append((range(first, last + 1), simulation))
-        first = last + 1
+        simulations.append((range(first, stop), simulation))
     return simulations
 
 
@@ -185,10 +181,10 @@ def _simulate(
 
     run = FreeRun(system, profile, z, v, hint=hint, **options)
     run.play(touching, halt)
-    given_up = next((e for e in run.events if e.kind is EventKind.GIVEN_UP), None)
     outcome = Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {run.t:.5g} s")
-    if given_up is not None:
-        outcome = Outcome(OutcomeKind.GIVEN_UP, given_up.text)
+    for event in run.events:
+        if event.kind is EventKind.GIVEN_UP:
+            outcome = Outcome(OutcomeKind.GIVEN_UP, event.text)
     return _conclude(run, problem, outcome, clock=np.asarray(starts))
 
 
@@ -267,15 +263,12 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
 
 
-def _require_start(problem: Problem, start: ArrayLike | None) -> Array:
-    if start is None:
-        return np.concatenate([problem.start, np.zeros(5)])
+def _require_start(start: ArrayLike) -> Array:
     try:
         state = np.asarray(start, dtype=float)
     except (TypeError, ValueError):
         raise InputError("", "start", "does not hold numbers") from None
     if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
-        raise InputError(
-            "", "start", f"shape {state.shape} given; 5 or 10 finite numbers are needed"
-        )
+        text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
+        raise InputError("", "start", text)
     return np.concatenate([state, np.zeros(10 - len(state))])

@@ -465,7 +465,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     x = np.linspace(-1, 1, 33)
     values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
     rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
-    steps = np.abs(values[1:, :, 0] - values[:-1, :, -1])
+    steps = np.abs(torque.jumps)
     misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
     for joint, (limit, fastest, lag) in enumerate(limits):
