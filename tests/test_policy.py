@@ -188,7 +188,7 @@ def test_speeds_along_a_curve_are_right_between_and_at_its_nodes(policy: Policy)
     tables |= {name: tables[name][:10] for name in ("levels", "torque", "forces")}
     law = CurveLaw(tables, policy.settings)
     for place in (0.401, 0.45, 0.499):
-        law._measure(place, place**2, 1.0, 2 * place)
+        law._measure((place, place**2), (1.0, 2 * place))
         assert law.v == pytest.approx(1.0, abs=2e-3)
 
 

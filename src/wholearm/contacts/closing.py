@@ -276,12 +276,7 @@ def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Number
 
 
 def _find_angle(
-    link: Finger,
-    sign: float,
-    kind: int,
-    x: Array,
-    y: Array,
-    outward: Array | None = None,
+    link: Finger, sign: float, kind: int, x: Array, y: Array, outward: Array | None = None
 ) -> Array:
     """Joint angles at which a link touches vertices or, with its tip, edges [rad].
 

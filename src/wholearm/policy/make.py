@@ -166,8 +166,8 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     slack[1][have_same_signs(*sides)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
     unit.append(np.tile(SETTINGS.spare * joint.scales[joint.sides[0]], (len(s), 1)))
-    tables = (np.concatenate(parts, axis=1) for parts in (slack, unit))
-    return CurveLimitRows(s, torque, *tables, 2 * slack[0].shape[1])
+    table, units = (np.concatenate(parts, axis=1) for parts in (slack, unit))
+    return CurveLimitRows(s, torque, table, units, 2 * slack[0].shape[1])
 
 
 def have_same_signs(before: Directions, after: Directions) -> Array:

@@ -133,7 +133,9 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
     if not isinstance(tables, Mapping):
         return ""
     for difference in _find(tables, problem):
-        _require_sense(difference, problem, what)
+        if other := _find_other(difference, problem):
+            given = f"{difference.one} in the {what}, {difference.other} here"
+            raise InputError("", difference.key, f"{given}; {other}")
     text = describe_differences(_find(tables, problem), f"in the {what}", "here")
     return f"made for another problem: {text}" if text else ""
 
@@ -147,19 +149,14 @@ def _find(own: Mapping[str, Any], problem: Problem) -> Iterator[Difference]:
     return find_differences(own, problem.table, free)
 
 
-def _require_sense(found: Difference, problem: Problem, what: str) -> None:
-    other = ""
+def _find_other(found: Difference, problem: Problem) -> str:
+    """Of which other scene a difference says that a plan is; empty where it is small enough."""
     if found.key == "object.vertices":
-        other = "its contacts are those of another polygon"
+        return "its contacts are those of another polygon"
     for finger in problem.scene.fingers:
         if found.key.startswith((f"{finger.name}.base", f"{finger.name}.length")):
-            try:
-                change = abs(float(found.one) - float(found.other))
-            except ValueError:
-                continue
-            # No error of measurement.
-            if change > 0.1 * finger.length:
-                other = "it is one of another hand"
-    if other:
-        text = f"{found.one} in the {what}, {found.other} here; {other}"
-        raise InputError("", found.key, text)
+            with suppress(ValueError):
+                # No error of measurement.
+                if abs(float(found.one) - float(found.other)) > 0.1 * finger.length:
+                    return "it is one of another hand"
+    return ""

@@ -129,10 +129,7 @@ _share_mode = lru_cache(maxsize=64)(Mode)
 
 
 def list_modes(
-    formation: Formation,
-    signs: Array,
-    units: Sequence[Unit],
-    options: Iterable[Sequence[float]],
+    formation: Formation, signs: Array, units: Sequence[Unit], options: Iterable[Sequence[float]]
 ) -> Iterator[tuple[Array, Mode]]:
     """Each combination of signs of some units, zero where held, that leaves a freedom to move in.
 

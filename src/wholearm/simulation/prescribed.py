@@ -230,12 +230,7 @@ class Replay(Run):
     slipping: frozenset[int]
 
     def __init__(
-        self,
-        problem: Problem,
-        torque: TorqueProfile,
-        tolerance: float,
-        wanted: Array,
-        minima: bool,
+        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array, minima: bool
     ) -> None:
         system = build_system(problem.scene)
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)

@@ -129,15 +129,13 @@ def verify_policy(
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))
-        brief, lasting = (
-            [loss for loss in losses if (loss.closes <= start + moment) is short]
-            for short in (True, False)
-        )
-        failures += describe_losses(number, lasting)
+        lasting = [loss for loss in losses if loss.closes > start + moment]
+        failures += [loss.describe(number) for loss in lasting]
         warnings += [
             f"{loss.contact} is open where phase {number} begins, by {loss.gap:.2g} m, and closes "
             f"within {loss.closes - start:.2g} s"
-            for loss in brief
+            for loss in losses
+            if loss not in lasting
         ]
         if not reached:
             failures.append(f"phase {number} does not end within {until:.4g} s")
@@ -152,18 +150,12 @@ def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: floa
     """Why phases from rest are not as planned."""
     texts = [] if simulation.outcome.kind is OutcomeKind.ENDED else [simulation.outcome.text]
     for phase in phases:
-        texts += [
-            f"phase {phase.number} alone: {loss.contact} is lost at t = {loss.time:.5g} s and "
-            f"opens by {loss.gap:.2g} m"
-            for loss in phase.losses
-        ]
-        end = phase.deviation
+        alone, end = f"phase {phase.number} alone", phase.deviation
+        texts += [f"{alone}: {loss.describe()}" for loss in phase.losses]
         assert end is not None
         if measure_departure(end, simulation.problem.scene.scales.length) > allowed:
-            texts.append(
-                f"phase {phase.number} alone ends {end.position:.3g} m and {end.angle:.3g} rad "
-                "away from the plan"
-            )
+            away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
+            texts.append(f"{alone} ends {away}")
     return texts
 
 
@@ -177,13 +169,12 @@ def _compare(
     plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
-    compared, starts = [], plan.phase_starts
+    compared, starts = [], plan.phase_starts.tolist()
     for phase in (simulation.problem.phases[index] for index in indices):
-        start, stop = float(starts[phase.index]), float(starts[phase.index + 1])
+        start, stop = starts[phase.index : phase.index + 2]
         losses = find_losses(simulation, phase, start, stop, allowed)
         end = measure_end(simulation, plan, phase.index, stop)
-        reached = end.time == stop
-        compared.append(FreePhase(phase.number, start, stop, reached, tuple(losses), end))
+        compared.append(FreePhase(phase.number, start, stop, end.time == stop, tuple(losses), end))
     return compared
 
 
@@ -192,15 +183,6 @@ def measure_end(simulation: FreeSimulation, plan: Trajectory, index: int, stop: 
     row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
     away = np.abs(simulation.z[row] - plan.z[np.flatnonzero(plan.phase == index)[-1]])
     return Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
-
-
-def describe_losses(number: int, losses: Sequence[LostContact]) -> list[str]:
-    """Sentences on contacts that open in the phase of a number."""
-    return [
-        f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {number}, and opens by "
-        f"{loss.gap:.2g} m"
-        for loss in losses
-    ]
 
 
 def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
@@ -214,7 +196,7 @@ def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase
         last = float(simulation.t[-1]) if stop is None else stop
         losses = find_losses(simulation, phase, start, last, allowed)
         phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
-        failures += describe_losses(phase.number, losses)
+        failures += [loss.describe(phase.number) for loss in losses]
         if stop is None:
             failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
             break
@@ -298,6 +280,13 @@ class LostContact(NamedTuple):
     gap: float  # [m]: by how much it opens
     closes: float  # [s]: when it presses again, or the phase ends
 
+    def describe(self, phase: int | None = None) -> str:
+        """Say it, and in which phase by its number if that is given."""
+        where = "" if phase is None else f", phase {phase},"
+        return (
+            f"{self.contact} is lost at t = {self.time:.5g} s{where} and opens by {self.gap:.2g} m"
+        )
+
 
 class FreePhase(NamedTuple):
     """A phase in a free simulation."""
@@ -306,9 +295,7 @@ class FreePhase(NamedTuple):
     start: float  # start, stop [s]:
     stop: float
     reached: bool  # whether its end came
-    losses: tuple[
-        LostContact, ...
-    ]  # contacts of the phase that opened by more than a bounce, by time
+    losses: tuple[LostContact, ...]  # contacts that opened by more than a bounce, by time
     deviation: Deviation | None  # from the plan at its end; None without a plan
 
 

@@ -283,9 +283,7 @@ def _report_phase(
         since = max(breaks, default=-math.inf)
         held = find_wedged(problem, phase, simulation, rows, REST_SPEED, since)
     if plan is not None:
-        # A motion that goes on is compared when its phase was planned to end, not when it did.
-        passes, length = phase.end is not End.REST, problem.scene.scales.length
-        end, worst = _compare(simulation, plan, index, bool(arrivals), passes, length)
+        end, worst = _compare(simulation, plan, phase, bool(arrivals))
     return PhaseReport(
         number=phase.number,
         until=until,
@@ -305,21 +303,21 @@ def _report_phase(
 
 
 def _compare(
-    simulation: Simulation, plan: Trajectory, index: int, arrived: bool, passes: bool, length: float
+    simulation: Simulation, plan: Trajectory, phase: Phase, arrived: bool
 ) -> tuple[Deviation | None, Deviation | None]:
     """Difference from the plan at the end of a phase and at worst."""
-    planned = np.flatnonzero(plan.phase == index)
+    planned, length = np.flatnonzero(plan.phase == phase.index), phase.formation.scene.scales.length
     if not len(planned):
         return None, None
-    at = np.searchsorted(simulation.t, plan.t[planned])
-    at = np.minimum(at, len(simulation.t) - 1)
+    at = np.minimum(np.searchsorted(simulation.t, plan.t[planned]), len(simulation.t) - 1)
     recorded = simulation.t[at] == plan.t[planned]
     difference = (simulation.z[at] - plan.z[planned])[recorded]
     worst = _measure(difference, plan.t[planned][recorded], length)
     if not arrived:
         return None, worst
-    last = int(np.flatnonzero(simulation.phase == index)[-1])
-    if passes and recorded[-1]:
+    last = int(np.flatnonzero(simulation.phase == phase.index)[-1])
+    # A motion that goes on is compared when its phase was planned to end, not when it did.
+    if phase.end is not End.REST and recorded[-1]:
         last = int(at[-1])
     difference = simulation.z[[last]] - plan.z[planned[-1:]]
     return _measure(difference, simulation.t[[last]], length), worst
@@ -353,13 +351,13 @@ def _balance(simulation: Simulation) -> EnergyBalance:
     ends = simulation.z_dot[[0, -1]]
     kinetic = float(np.diff(0.5 * ends**2 @ scene.mass_diagonal)[0])
     potential = float(scene.weight * (simulation.z[-1, 1] - simulation.z[0, 1]))
-    losses = {
-        name: float(getattr(energies, name)[-1]) for name in ("viscous", "dry", "contact", "impact")
-    }
-    work, residual = float(energies.work[-1]), float(energies.residual[-1])
-    scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses.values()))
+    work, viscous, dry, contact, impact, residual = (
+        float(part[-1]) for part in (*energies[1:], energies.residual)
+    )
+    losses = viscous, dry, contact, impact
+    scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses))
     relative = abs(residual) / scale if scale > 0 else 0.0
-    return EnergyBalance(work, kinetic, potential, **losses, residual=residual, relative=relative)
+    return EnergyBalance(work, kinetic, potential, *losses, residual, relative)
 
 
 def list_normal_forces(simulation: Simulation, phase: Phase) -> dict[str, Array]:
@@ -476,9 +474,8 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
         if len(steps) and steps[worst, joint] > 1e-5 * limit:
             t = float(torque.breaks[worst + 1])
             text = f"{name} steps by {steps[worst, joint]:.3g} N m at t = {t:.5g} s"
-            why = (
-                f"its rate limit is {fastest:g} N m/s" if np.isfinite(fastest) else "its motor lags"
-            )
+            limited = f"its rate limit is {fastest:g} N m/s"
+            why = limited if np.isfinite(fastest) else "its motor lags"
             misses.append((t, f"{text}, where {why}"))
         kinds = (
             (rates[:, joint], fastest, "changes at {:.4g} N m/s, above its rate limit {:g} N m/s"),
@@ -580,10 +577,9 @@ def find_help(
     problem = simulation.problem
     rolling = [{contact.name for contact in phase.formation.rolling} for phase in problem.phases]
     events = [
-        (event.phase, event.contact, _KINDS[event.kind], event.time)
-        for event in simulation.events
-        if event.kind is EventKind.CONTACT_LOST
-        or (event.kind is EventKind.SLIP and event.contact in rolling[event.phase])
+        (e.phase, e.contact, _KINDS[e.kind], e.time)
+        for e in simulation.events
+        if e.kind in _KINDS and (e.kind is not EventKind.SLIP or e.contact in rolling[e.phase])
     ]
     ended = {event[:2] for event in events}
     allowed = allowance.measure_stray(problem)
