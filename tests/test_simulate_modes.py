@@ -579,7 +579,7 @@ def test_start_with_two_freedoms() -> None:
     rest, seen = find_rest(phase.formation, z), 0
     assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
-    assert len(rest.modes) == 2**5 + 5 * 2**4
+    assert len(list(rest.list_modes())) == 2**5 + 5 * 2**4
     while seen < 3:
         tau = np.array([1.0, -1.0]) * rng.uniform(0.0, 2.0, size=2)
         change_of_state = rest.wait(tau[:, None], -1.0)

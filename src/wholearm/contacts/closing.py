@@ -365,20 +365,17 @@ def name_reach(scene: Scene, phi: float) -> str:
     low, high = find_reach(scene)
     x = np.linspace(low, max(low, high), 1000)
     closes = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
-    runs = find_runs(closes, least=2)
-    spans = [_round(float(x[run.start]), float(x[run.stop - 1])) for run in runs]
+    spans = []
+    for run in find_runs(closes, least=2):
+        first, last = float(x[run.start]), float(x[run.stop - 1])
+        # In few digits, inside of the span.
+        digits = 2 - math.floor(math.log10(last - first))
+        step = 10.0**-digits
+        first, last = math.ceil(first / step) * step, math.floor(last / step) * step
+        spans.append(f"from {round(first, digits):g} to {round(last, digits):g}")
     if not spans:
         return "at that angle the hand closes at no x"
-    every = " and ".join(f"from {first:g} to {last:g}" for first, last in spans)
-    return f"at that angle the hand closes for x {every}"
-
-
-def _round(low: float, high: float) -> tuple[float, float]:
-    """Ends of a span in few digits, inside of it."""
-    digits = 2 - math.floor(math.log10(high - low))
-    step = 10.0**-digits
-    inner = math.ceil(low / step) * step, math.floor(high / step) * step
-    return round(inner[0], digits), round(inner[1], digits)
+    return f"at that angle the hand closes for x {' and '.join(spans)}"
 
 
 class ExplicitMotion(NamedTuple):

@@ -11,7 +11,6 @@ The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p again
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import product
@@ -123,11 +122,17 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
     along = Xi * (kinematics.A_t[0] @ v_after)
+    values = (
+        (ViolationKind.HELD, speed, after.names, along),
+        (ViolationKind.PULL, momentum, after.names, normal),
+        (ViolationKind.SLIP, momentum, [*rolls, *rolls], cones),
+        (ViolationKind.CLOSING, speed, *_rates(before, after, z, v_after)),
+    )
     violations = [
-        *_list(ViolationKind.HELD, after.names, along, ROUNDING * speed),
-        *_list(ViolationKind.PULL, after.names, normal, ROUNDING * momentum),
-        *_list(ViolationKind.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
-        *_list(ViolationKind.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
+        ImpactViolation(kind, names[k], float(amounts[k]))
+        for kind, unit, names, amounts in values
+        for k in np.argsort(amounts)
+        if amounts[k] < -ROUNDING * unit
     ]
     return Impact(after, v_after, p, Xi, tuple(violations))
 
@@ -140,17 +145,6 @@ def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tup
     lift = force_rows.T / mass[:, None]
     p = -np.linalg.solve(rows @ lift, rows @ v)
     return np.asarray(v + lift @ p), np.asarray(p)
-
-
-def _list(
-    kind: ViolationKind, names: Sequence[str], values: Array, rounding: float
-) -> list[ImpactViolation]:
-    """Those of the values that are below zero, the least first."""
-    return [
-        ImpactViolation(kind, names[k], float(values[k]))
-        for k in np.argsort(values)
-        if values[k] < -rounding
-    ]
 
 
 def _rates(

@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -253,9 +254,12 @@ def interpolate_quintic(
     )
 
 
+_DOTS = ("", "_dot", "_ddot")
+
+
 def split_motion(z: Array, z_dot: Array, z_ddot: Array) -> dict[str, Array]:
     """Degrees of freedom and their derivatives, (n, 5) each, as a `Trajectory` names its arrays."""
-    pairs = zip(("", "_dot", "_ddot"), (z, z_dot, z_ddot), strict=True)
+    pairs = zip(_DOTS, (z, z_dot, z_ddot), strict=True)
     parts = ("q", slice(3)), ("theta", slice(3, 5))
     return {f"{name}{dots}": of[:, part] for dots, of in pairs for name, part in parts}
 
@@ -268,10 +272,10 @@ def sample_phases(
     for index in sort_unique(arrays["phase"]):
         parts = {name: array[arrays["phase"] == index] for name, array in arrays.items()}
         held = ~np.isnan(parts["c_n"]).all(axis=0)
-        names = ("q", "theta"), ("q_dot", "theta_dot"), ("q_ddot", "theta_ddot")
-        z, z_dot, z_ddot = (np.hstack([parts[one], parts[other]]) for one, other in names)
+        pairs = ((parts[f"q{dots}"], parts[f"theta{dots}"]) for dots in _DOTS)
+        z, z_dot, z_ddot = map(np.hstack, pairs)
         forces = parts["tau"], parts["c_n"][:, held], parts["c_t"][:, held]
-        contact_names = tuple(name for name, here in zip(contacts, held, strict=True) if here)
+        contact_names = tuple(compress(contacts, held))
         motions.append(SampledMotion(parts["t"], contact_names, Samples(z, z_dot, z_ddot, *forces)))
     return tuple(motions)
 

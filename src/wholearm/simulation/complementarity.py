@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
-from itertools import pairwise, product
+from itertools import pairwise, product, takewhile
 from typing import NamedTuple
 
 import casadi as ca
@@ -341,8 +341,8 @@ class Pattern:
                 choice[k] = mode
         return choice + signs[len(self.standing) :]
 
-    def make_modes(self, answer: ContactAnswer, rows: ContactRows) -> Modes:
-        """Independent constraints that give the answer's motion."""
+    def make_modes(self, answer: ContactAnswer, at: ContactRows) -> Modes:
+        """Independent constraints, of rows `at` a state, that give the answer's motion."""
         system, closed = self.system, self.closed
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
@@ -362,10 +362,9 @@ class Pattern:
             basis.append(rest / left)
             return True
 
-        kept = {k for k in order if presses[k] and adds(rows.A[k])}
-        count = len(self.standing)
-        stuck, Xi = [], self.Xi.copy()
-        held, sigma = [], self.sigma.copy()
+        kept = {k for k in order if presses[k] and adds(at.A[k])}
+        count, stuck, held = len(self.standing), [], []
+        Xi, sigma = self.Xi.copy(), self.sigma.copy()
         sigma[self.joints] = answer.sign[count:]
         # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first:
         # decisions in the least-time policy of the square do not end else.
@@ -377,18 +376,14 @@ class Pattern:
                     held.append(joint)
             elif (k := int(self.standing[j])) in kept:
                 Xi[k] = sign
-                if sign == 0 and adds(rows.A_t[k]):
+                if sign == 0 and adds(at.A_t[k]):
                     stuck.append(k)
         # What touches without a force stays, for as long as it needs none.
-        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(rows.A[k])}
-        kept_pairs = sorted(kept)
-        return Modes(
-            tuple(closed[k] for k in kept_pairs),
-            tuple((pair,) for pair in sorted(closed[k] for k in stuck)),
-            tuple(sorted(held)),
-            tuple(float(Xi[k]) for k in kept_pairs),
-            tuple(sigma.tolist()),
-        )
+        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(at.A[k])}
+        rows = sorted(kept)
+        pairs, stick = tuple(closed[k] for k in rows), sorted((closed[k],) for k in stuck)
+        signs = tuple(Xi[rows].tolist()), tuple(sigma.tolist())
+        return Modes(pairs, tuple(stick), tuple(sorted(held)), *signs)
 
 
 class FreeRun(Run):
@@ -465,11 +460,9 @@ class FreeRun(Run):
         rises tenfold after 20 and after 40 impacts in a short time, and after every 200: scene 37
         of seed 5 of the stress study does not end else, with finger 1 reversed from half time on.
         """
-        since, recent = self.t - 3e-4 * self.system.scales.time, 0
-        for event in reversed(self.events):
-            if event.time < since:
-                break
-            recent += event.kind is EventKind.IMPACT
+        since = self.t - 3e-4 * self.system.scales.time
+        late = takewhile(lambda event: event.time >= since, reversed(self.events))
+        recent = sum(event.kind is EventKind.IMPACT for event in late)
         # Impacts need no finer steps than these.
         least = max(CHATTER, 1e3 * self.tolerance)
         raised = min(recent // 20, 2) + recent // 200
@@ -717,10 +710,11 @@ class FreeRun(Run):
             self.note_at(EventKind.GAINED, f"{names[pair]} presses", names[pair])
         if not self.records:
             before = modes
+        slid = dict(zip(before.kept, before.Xi, strict=True))
         changes = [
-            (names[pair], before.Xi[before.kept.index(pair)], Xi, "slides")
+            (names[pair], slid[pair], Xi, "slides")
             for pair, Xi in zip(modes.kept, modes.Xi, strict=True)
-            if pair in before.kept and system.friction[pair] > 0
+            if pair in slid and system.friction[pair] > 0
         ]
         joints = zip(before.sigma, modes.sigma, strict=True)
         changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
@@ -744,10 +738,8 @@ class FreeRun(Run):
         differs = [len(set(modes)) > 1 for modes in zip(*answers, strict=True)]
         texts = []
         for answer in answers:
-            labelled_modes = zip(told, answer, differs, strict=True)
-            parts = [
-                f"{name} {words[mode]}" for (name, words), mode, other in labelled_modes if other
-            ]
+            modes = zip(told, answer, differs, strict=True)
+            parts = [f"{name} {words[mode]}" for (name, words), mode, other in modes if other]
             texts.append(", ".join(parts) or "the rest accelerates otherwise")
         text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed"
         text += f" ({'; or '.join(texts)})"

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations, product
@@ -317,13 +318,8 @@ class Rest:
         """Start modes in which friction holds some contact or joint, the least first."""
         return () if self.heading is not None else self._list_patterns(held=True)
 
-    @property
-    def modes(self) -> tuple[StartMode, ...]:
-        """All start modes."""
-        return self.sliding + self.sticking
-
-    def _list_modes(self) -> Iterator[StartMode]:
-        # Those with sticking are built when first needed: most never are.
+    def list_modes(self) -> Iterator[StartMode]:
+        """All start modes; those with sticking are built when first needed: most never are."""
         yield from self.sliding
         yield from self.sticking
 
@@ -331,8 +327,7 @@ class Rest:
     def touching(self) -> Statics:
         """That of every contact that touches, in the formation or not."""
         gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.statics.near)]
-        others = (contact for contact in gained if contact is not None)
-        contacts = *self.formation.contacts, *others
+        contacts = *self.formation.contacts, *(contact for contact in gained if contact)
         return Statics(Formation(self.formation.scene, contacts), self.z)
 
     @cached_property
@@ -401,7 +396,7 @@ class Rest:
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
         tau = _evaluate(coefficients, x)
-        for mode in self._list_modes():
+        for mode in self.list_modes():
             if mode.moves(tau):
                 return mode.depart(x, tau)
         # Where torques cannot be held any more; infinite if they can all along.
@@ -409,8 +404,8 @@ class Rest:
         loss = x
         if np.isfinite(bounds).all():
             loss = find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
-        least = 1e3 * _measure_drive(self.formation.scene)
-        margins = [mode.margins for mode in self.modes]
+        least, every = 1e3 * _measure_drive(self.formation.scene), list(self.list_modes())
+        margins = [mode.margins for mode in every]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
         # Where a margin changes sign; in between, no mode changes.
@@ -422,7 +417,7 @@ class Rest:
         for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
             if start > loss:
                 break
-            modes = [self.modes[k] for k in np.flatnonzero(chosen)]
+            modes = [every[k] for k in np.flatnonzero(chosen)]
             for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
                 if mode.drive(tau) > least and mode.moves(tau):
                     return mode.depart(start, tau)
@@ -433,7 +428,7 @@ class Rest:
         tau = _evaluate(coefficients, x)
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
-        free = [mode for mode in self.modes if mode.slides(tau)]
+        free = [mode for mode in self.list_modes() if mode.slides(tau)]
         pulls = self.touching.find_pulls(tau)
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
@@ -491,7 +486,7 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
         roots = -level / slope
     else:
         rows = set(map(tuple, polynomials.tolist()))
-        roots = np.array([root for row in rows for root in find_roots(np.array(row))])
+        roots = np.array([root for row in rows for root in _find_roots(np.array(row))])
     starts = np.array([x, *sort_unique(roots[(x < roots) & (roots < 1)])])
     return starts, (starts + np.append(starts[1:], 1.0)) / 2
 
@@ -503,7 +498,7 @@ def find_breach(polynomials: Array, x: float) -> float:
     return float(starts[low.argmax()]) if low.any() else np.inf
 
 
-def find_roots(polynomial: Array) -> list[float]:
+def _find_roots(polynomial: Array) -> list[float]:
     """Real roots of a polynomial given by ascending coefficients."""
     significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
     if not len(significant) or significant[-1] == 0:
@@ -587,12 +582,11 @@ def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hol
     if opening is None:
         return firm
     swift = 2 * gap / time**2
-    closing = _find_closing(place, rest, opening, gap)
-    slow = _find_closing(place, rest, opening, gap, swift) if closing is None else None
+    if closing := _find_closing(place, rest, opening, gap):
+        return closing
+    slow = _find_closing(place, rest, opening, gap, swift)
     # Torques that close slowly hold less well than those that only hold, but by not too much.
-    if slow is not None and slow.margin > 0.2 * firm.margin:
-        return slow
-    return closing or firm
+    return slow if slow is not None and slow.margin > 0.2 * firm.margin else firm
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
@@ -674,13 +668,10 @@ def _find_closing(
             continue
         a = float(closing @ [1.0, *tau])
         v = mode.response.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
-        try:
-            violations = compute_impact(place.formation, place.touching, place.z, v).violations
-        except np.linalg.LinAlgError:
-            violations = ()
-        parts = tuple(
-            violation.name for violation in violations if violation.kind is ViolationKind.PULL
-        )
+        parts: tuple[str, ...] = ()
+        with suppress(np.linalg.LinAlgError):
+            impact = compute_impact(place.formation, place.touching, place.z, v)
+            parts = tuple(v.name for v in impact.violations if v.kind is ViolationKind.PULL)
         best = Hold(tau, margin, math.sqrt(2 * a * gap), parts)
     return best
 

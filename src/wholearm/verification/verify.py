@@ -193,11 +193,11 @@ def observe(
 def find_finger_gap(simulation: Simulation) -> FingerGap:
     """Least gap of the fingers, on quintics through the recorded states."""
     t, z, scene = simulation.t, simulation.z, simulation.problem.scene
-    left, share = np.flatnonzero(np.diff(t) > 0), np.arange(1, 8) / 8
-    h, run = np.repeat(np.diff(t)[left], 7), np.outer(np.diff(t)[left], share).ravel()
-    knots = z, simulation.z_dot, simulation.z_ddot
-    inside = interpolate_quintic(h, run, knots, np.repeat(left, 7))[0]
-    times = np.append(t, np.repeat(t[left], 7) + run)
+    left = np.repeat(np.flatnonzero(np.diff(t) > 0), 7)
+    h = np.diff(t)[left]
+    run = h * np.resize(np.arange(1, 8) / 8, len(h))
+    inside = interpolate_quintic(h, run, (z, simulation.z_dot, simulation.z_ddot), left)[0]
+    times = np.append(t, t[left] + run)
     order = np.argsort(times, kind="stable")
     gaps = evaluate_finger_gap(scene, np.concatenate([z, inside]))
     return FingerGap(*find_lowest(times[order], gaps[order], 2 * SETTLING * scene.scales.time))
@@ -613,7 +613,7 @@ def _examine_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        paths = find_rest(formation, z).modes
+        paths = list(find_rest(formation, z).list_modes())
         free = [path for path in paths if path.slides(tau)]
         worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
         response = None if worst is None else worst.response
