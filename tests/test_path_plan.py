@@ -22,6 +22,7 @@ from scenes import box, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm import Formation, Friction, Problem, Scene
+from wholearm.benchmark.scenes import draw_case
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve, directions_of
@@ -765,3 +766,14 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     assert isinstance(edge, Edge) and edge.estimate == pytest.approx(
         look_along([slow], epsilon, 1000), rel=0.2
     )
+
+
+def test_torques_follow_a_motion_that_fades() -> None:
+    """Half of the last interval's time passes on a hundredth of its way."""
+    problem = build_problem(draw_case(1128, 462).table)
+    trajectory = solve(problem, "margin", replay=False).trajectory
+    (motion,), torque = trajectory.motions, trajectory.torque
+    t = np.linspace(0.0, motion.duration, 2001)
+    t = t[np.abs(t[:, None] - torque.breaks).min(axis=1) > 1e-9 * motion.duration]
+    misfit = (torque.at(t) - motion.evaluate(t).tau) / problem.scene.torque_limit
+    assert np.abs(misfit).max() < 1e-5

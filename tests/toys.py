@@ -21,7 +21,7 @@ from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
 from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain import path_data, path_plan
+from wholearm.planning.path_domain import path_data, path_motion, path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -42,6 +42,11 @@ class LinePoint(tuple[Array, Array, Array]):
     def z_s(self) -> Array:
         """Their derivatives along the line, shape (n, 5)."""
         return self[1]
+
+    @property
+    def z_ss(self) -> Array:
+        """Their second derivatives, shape (n, 5)."""
+        return self[2]
 
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
@@ -93,6 +98,7 @@ class Toy:
             rolling=(),
             rolling_rows=(),
             friction=np.zeros(1),
+            sliding_friction=np.zeros(1),
         )
         stub: Any = SimpleNamespace(length=self.length, segments=segments, formation=formation)
         stub.evaluate = _evaluate
@@ -109,6 +115,7 @@ class Toy:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(lower_bound, "inverse", self._inverse)
             patch.setattr(path_data, "inverse", self._inverse)
+            patch.setattr(path_motion, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             # A toy has no shape that friction could hold at rest.
             patch.setattr(path_plan, "find_sure_start", lambda *_: None)

@@ -268,30 +268,34 @@ def choose_sampling(nodes: int) -> Sampling:
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
     """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
 
-    Through the knots, or through `PLACES` points if that misses the torque between them.
+    Through the knots, or through Chebyshev points in time if that misses the torque between them.
+
+    Raises
+    ------
+    SolverError  if the motion all but stops in an interval
     """
-    knots, checks = data.sampling
-    torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.grid.nonempty, None] + motion.durations(checks)
+    k, (knots, checks) = data.grid.nonempty, data.sampling
+    spans = motion.durations(knots)
+    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
+        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
+    breaks = np.append(motion.times[k], motion.times[-1])
+    values = data.knots.forces.tau(*data.interpolate(motion.profile, knots))
+    torque = _fit(breaks, 2 * spans / spans[:, -1:] - 1, values)
+    times = motion.times[k, None] + motion.durations(checks)
     wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
+    inner = np.tile((checks > 0) & (checks < 1), len(k))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        torque = _fit(data, motion, *data.pick_places())
+        x = -np.cos(np.pi * (np.arange(PLACES) + 0.5) / PLACES)
+        places = breaks[:-1, None] + np.diff(breaks)[:, None] * (1 + x) / 2
+        torque = _fit(breaks, x[None], motion.evaluate(places.ravel()).tau)
     return torque, torque.integrate_squares()
 
 
-def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
-    """Polynomials through the torques at `fractions` of every solid interval."""
-    k = data.grid.nonempty
-    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
-    spans = motion.durations(fractions)
-    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
-        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
-    x = 2 * spans / spans[:, -1:] - 1
-    vandermonde = x[..., None] ** np.arange(len(fractions))
-    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
-    breaks = np.append(motion.times[k], motion.times[-1])
+def _fit(breaks: Array, x: Array, tau: Array) -> TorqueProfile:
+    """Polynomials through torques at places x in [-1, 1] of every interval, (n or 1, m)."""
+    vandermonde = x[..., None] ** np.arange(x.shape[1])
+    coefficients = np.linalg.solve(vandermonde, tau.reshape(len(breaks) - 1, -1, 2))
     return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
 
 
