@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
@@ -21,36 +23,27 @@ from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
 from scenes import box, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
-from wholearm import Formation, Friction, Problem, Scene
+from wholearm import Problem
 from wholearm.benchmark.scenes import draw_case
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
-from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, Directions, V, inverse
-from wholearm.mechanics.limits import make_limits
+from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, inverse
 from wholearm.planning import lower_bound
 from wholearm.planning.blocks import make_sequence
 from wholearm.planning.lower_bound import (
     LowerBound,
     bound_least_time,
-    find_least,
-    find_limits,
     look_along,
 )
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
-from wholearm.planning.path_domain.path_data import prepare
-from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import (
     LimitShape,
     PathNLP,
-    Relaxation,
     build_path_nlp,
-    guess,
-    pack,
-    parameters,
 )
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -78,12 +71,52 @@ def check_accuracy(toy: Toy, exact: float, best: int, **options: Any) -> None:
         assert error < 4 * plan.error + 3e-6
 
 
+def bound(toy: Toy) -> LowerBound:
+    with toy.in_place():
+        found = bound_least_time([toy.curve], toy.epsilon)
+    assert found is not None
+    return found
+
+
+STEPPING = Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,))
+TOP, AT_BREAK = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
+CLOSED = [
+    (Toy(constant(1.0)), math.sqrt(2.0)),
+    (Toy(constant(1.0), length=0.03), 2 * math.sqrt(0.03 / LIMIT)),
+    (Toy(constant(1.0, 1.0)), 2 / math.sqrt(LIMIT - EPSILON)),
+    (Toy(constant(1.0), speed_limit=(0.3, np.inf)), 1 / 0.3 + 0.3 / LIMIT),
+    (Toy(constant(1.0), speed_limit=(1.2, np.inf)), 1 / 1.2 + 1.2 / LIMIT),
+    (Toy(constant(1.0), speed_limit=(1.6, np.inf)), math.sqrt(2.0)),
+    (Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing()),
+    (STEPPING, (2 * TOP - AT_BREAK) / LIMIT + AT_BREAK / (LIMIT / 2)),
+    *((Toy(constant(1.0, 0.0, drag)), find_time_viscous(drag)) for drag in (0.1, 0.5, 3.0)),
+]
+
+
+@pytest.mark.parametrize("toy, exact", CLOSED)
+def test_least_times_are_planned_and_bounded_as_in_closed_form(toy: Toy, exact: float) -> None:
+    check_accuracy(toy, exact, -1)
+    found = bound(toy)
+    assert exact * (1 - 1e-6) < found.value <= exact * (1 + 1e-9)
+    assert 0 <= found.error < 1e-7 * exact
+
+
+def test_motions_integrate_their_acceleration() -> None:
+    """S' is the integral of s'' over time, and s that of s'; a coarse grid, and a jump of s''."""
+    motion, (nodes, weights) = STEPPING.plan(intervals=10).motion, legendre.leggauss(20)
+    speed, place = 0.0, 0.0
+    for k in motion.grid.nonempty.tolist():
+        start, stop = motion.times[k : k + 2]
+        _, _, here = motion.locate(start + (1 + nodes) / 2 * (stop - start))
+        place += (stop - start) / 2 * float(weights @ np.sqrt(here.b))
+        speed += (stop - start) / 2 * float(weights @ here.a)
+        assert place == pytest.approx(motion.grid.s[k + 1], abs=1e-10)
+        assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-8)
+
+
 @pytest.mark.parametrize("length", [0.03, 1.0, 4.0])
 def test_least_time_is_bang_bang(length: float) -> None:
-    toy = Toy(constant(1.0), length=length)
-    exact = 2 * math.sqrt(length / LIMIT)
-    check_accuracy(toy, exact, -1)
-    plan = toy.plan()
+    exact, plan = 2 * math.sqrt(length / LIMIT), Toy(constant(1.0), length=length).plan()
     t = np.linspace(0, plan.motion.duration, 2001)
     a = plan.motion.locate(t)[2].a
     assert (np.abs(np.abs(a) - LIMIT) < 1e-3 * LIMIT).mean() > 0.95
@@ -108,10 +141,7 @@ def test_least_effort_of_a_free_run(weight: float) -> None:
 
 @pytest.mark.parametrize("speed", [0.3, 0.7, 1.2])
 def test_joint_speed_limit_makes_a_trapezoid(speed: float) -> None:
-    toy = Toy(constant(1.0), speed_limit=(speed, np.inf))
-    exact = 1 / speed + speed / LIMIT
-    check_accuracy(toy, exact, -1)
-    plan = toy.plan()
+    plan, exact = Toy(constant(1.0), speed_limit=(speed, np.inf)).plan(), 1 / speed + speed / LIMIT
     t = np.linspace(0, plan.motion.duration, 4001)
     b = plan.motion.locate(t)[2].b
     assert np.sqrt(b.max()) <= speed * (1 + 5e-7)
@@ -133,23 +163,10 @@ def test_largest_margin_within_a_duration(duration: float) -> None:
 
 def test_inertia_that_steps_at_a_reversal() -> None:
     """Inertia 1, then 2: the switch at 3/8, and the acceleration jumps at 1/2."""
-    toy = Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,))
-    top, at_break = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
-    exact = (top + (top - at_break)) / LIMIT + at_break / (LIMIT / 2)
-    check_accuracy(toy, exact, -1)
-    motion = toy.plan().motion
+    motion = STEPPING.plan().motion
     (gap,) = np.flatnonzero(np.diff(motion.grid.segment))
     assert motion.grid.steps[gap] == 0.0
     np.testing.assert_allclose(motion.profile.a[[gap, gap + 1]], [-LIMIT, -LIMIT / 2], rtol=1e-3)
-
-
-def test_inertia_that_grows_along_the_way() -> None:
-    check_accuracy(Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing(), -1)
-
-
-@pytest.mark.parametrize("drag", [0.1, 0.5])
-def test_viscous_joints(drag: float) -> None:
-    check_accuracy(Toy(constant(1.0, 0.0, drag)), find_time_viscous(drag), -1)
 
 
 PHASES = range(5)
@@ -171,13 +188,29 @@ def plan_line(
 
 def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
-    epsilon = 0.8
     slow = with_speed_limit(curves[2], (0.3, 0.3))
     with pytest.raises(SolverError):
-        plan_curves((slow,), epsilon, PlanOptions(intervals=20), (3,), explained=False)
-    bound = bound_least_time([curves[2]], epsilon)
-    chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=160), 3)
-    assert bound is not None and -1e-7 < chosen.value / bound.value - 1 < 2e-4
+        plan_curves((slow,), 0.8, PlanOptions(intervals=20), (3,), explained=False)
+    check_bound((curves[2],), 0.8, 160, 2e-4)
+
+
+def check_bound(curves: Sequence[Curve], epsilon: float, intervals: int, excess: float) -> None:
+    """Least times are above their lower bounds, which are good to their errors, by little."""
+    found = bound_least_time(curves, epsilon)
+    assert found is not None and found.error < 3e-8 * found.value
+    options = PlanOptions(intervals=intervals, uniqueness_margin=ANY)
+    numbers = range(1, len(curves) + 1)
+    plans = plan_curves(curves, epsilon, options, tuple(numbers), explained=False)
+    assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < excess
+
+
+def test_plans_come_near_the_bound(curves: tuple[Curve, ...]) -> None:
+    """Along curves, where a vertex rolls, and through impacts."""
+    for curve in (curves[0], curves[2], curves[4], tip_on(0.5)):
+        check_bound((curve,), EPSILON, 80, 2e-4)
+    problem = problem_of(IMPACTS)
+    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
+    check_bound(chain.continuous_curves, EPSILON, 80, 5e-4)
 
 
 # Phases that are run through one after the other.
@@ -221,20 +254,6 @@ def test_other_objectives_converge(curves: tuple[Curve, ...], phase: int, object
     assert (better if objective == "margin" else -better) > -1e-5
 
 
-def count_swings(values: Array, size: float) -> int:
-    """How often values turn round by more than `size`."""
-    swings, low, high, way = 0, values[0], values[0], 0
-    for value in values:
-        low, high = min(low, value), max(high, value)
-        if way >= 0 and value < high - size:
-            swings += way > 0
-            way, low, high = -1, value, value
-        elif way <= 0 and value > low + size:
-            swings += way < 0
-            way, low, high = 1, value, value
-    return swings
-
-
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("phase", PHASES)
 def test_torques_do_not_jitter(phase: int, objective: str) -> None:
@@ -245,12 +264,9 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
     hair = 1e-9 * motion.duration
     for start, stop in pairwise(ends):
         t = np.linspace(start + hair, stop - hair, 401)
+        # A plan has a few switches, not dozens: torques go to and fro little more than once.
         for tau in motion.evaluate(t).tau.T:
-            # A swing is one of 1 % of the limit. A plan has a few switches, not dozens.
-            assert count_swings(tau, 0.01 * STRONG) <= 5
             assert np.abs(np.diff(tau)).sum() <= 3.2 * np.ptp(tau) + 0.1
-        lam = motion.locate(t)[2].lam
-        assert count_swings(lam, 0.01 * np.ptp(lam) + 0.05) <= 6
 
 
 # No plan: why, where and by how much.
@@ -347,19 +363,6 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
 
 
-@pytest.mark.parametrize("goal", Objective)
-def test_the_slope_of_b_is_twice_a_whatever_is_minimised(goal: Objective) -> None:
-    curve = trace_phases(problem_of(HEPTAGON))[0]
-    data = prepare(curve, EPSILON, make_grid(curve, np.zeros(0), 6), 1)
-    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal)
-    profile, units = guess(data)
-    relaxed = Relaxation(data.limits.parameters[0], 1.0) if goal is Objective.RELAX else None
-    given = parameters(nlp, data, units, 1.0, relaxed)
-    g = nlp.solver.function.get_function("nlp_g")(pack(nlp, profile, units, 0.1), given)
-    # The parabola of the guess is one of the polynomials of b.
-    assert np.abs(g.full()[nlp.g["links"]]).max() < 1e-12
-
-
 BOX_LIMIT = float(box().scene.torque_limit.max())
 ANY = -1.0
 """Least uniqueness margin that cones are looked at with, unique or not."""
@@ -368,11 +371,9 @@ ANY = -1.0
 @cache
 def tip_on(mu: float) -> Curve:
     """The box tipping over vertex 1 on a palm of friction `mu`; the curve does not depend on it."""
-    curve = tip()
-    scene, old = curve.formation.scene, curve.formation
-    friction = Friction(mu, scene.friction.finger1, scene.friction.finger2)
-    other = Scene(scene.polygon, scene.fingers, friction, scene.gravity)
-    return replace(curve, formation=Formation(other, old.contacts, old.rolling))
+    curve, scene = tip(), tip().formation.scene
+    rough = replace(scene, friction=replace(scene.friction, palm=mu))
+    return replace(curve, formation=replace(curve.formation, scene=rough))
 
 
 @cache
@@ -422,12 +423,6 @@ def test_planned_forces_balance_every_body(objective: str) -> None:
     np.testing.assert_allclose(samples.c_t[:, 1:], law, rtol=1e-12)
 
 
-def test_least_time_comes_near_its_lower_bound() -> None:
-    bound = bound_least_time([tip_on(0.5)], EPSILON)
-    assert bound is not None
-    assert -1e-7 < plan_tip("time", 0.5, 80).value / bound.value - 1 < 2e-4
-
-
 def test_the_cone_is_what_holds_the_fastest_motion_back() -> None:
     """It is touched on both sides; on a rougher palm the box tips faster."""
     samples = sample(plan_tip(), 4000)
@@ -471,14 +466,23 @@ def is_feasible(limits: dict[str, float], phase: int, friction: float = 0.1) -> 
     return True
 
 
-def test_advised_values_are_feasible_and_hardly_larger_than_needed() -> None:
+@pytest.mark.parametrize(
+    "phase, limits, names",
+    [
+        (3, {"epsilon": 0.6, "torque limit of finger 1": 0.3}, [LIMITS[0], "epsilon"]),
+        (1, {"epsilon": 1.0}, ["epsilon"]),
+    ],
+)
+def test_advised_values_are_feasible_and_hardly_larger_than_needed(
+    phase: int, limits: dict[str, float], names: list[str]
+) -> None:
     """Checked by planning anew with the limit in the problem file changed."""
-    name = "torque limit of finger 1"
-    limits = {"epsilon": 0.6, name: 0.3}
-    advised = read_advice(ask(3, **limits))
-    assert list(advised) == [name, "epsilon"] and advised[name] > limits[name]
-    assert is_feasible(limits | {name: advised[name]}, 3)
-    assert not is_feasible(limits | {name: advised[name] / 1.03}, 3)
+    advised = read_advice(ask(phase, **limits))
+    assert list(advised) == names
+    for name, value in advised.items():
+        short = 1.04 if name == "epsilon" else 1 / 1.04
+        assert is_feasible(limits | {name: value}, phase)
+        assert not is_feasible(limits | {name: short * value}, phase)
 
 
 def test_where_nothing_is_advised_nothing_helps() -> None:
@@ -488,85 +492,6 @@ def test_where_nothing_is_advised_nothing_helps() -> None:
     for name in LIMITS:
         generous = 0.0 if name == "epsilon" else 300.0
         assert not is_feasible(limits | {name: generous}, 1, 0.3)
-
-
-def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | None:
-    """The value at which one limit lets all others be kept at the nodes, without viscous drag.
-
-    Then everything is linear in a, b and the squeeze at the nodes.
-    """
-    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), INTERVALS // 4), 1)
-    nodes, n_c = len(data.grid.s), 4
-    forces, steps = data.nodes.forces, data.grid.steps
-    assert not forces.of_tau[..., V].any()
-    last = 3 * nodes
-    rows: list[Array] = []
-    right: list[Array] = []
-    tau_limit = data.torque_limit
-    relaxed = np.zeros((nodes, last + 1))
-    relaxed[:, last] = 1.0
-
-    def write(of_a: Array, of_b: Array, of_squeeze: Array) -> Array:
-        """Rows of one force or torque, one for each node."""
-        parts = [np.diag(part) for part in (of_a, of_b, of_squeeze)]
-        return np.hstack([*parts, np.zeros((nodes, 1))])
-
-    for i in range(n_c):
-        # c_n >= epsilon, or what epsilon is relaxed to.
-        give = name == "epsilon"
-        row = write(forces.of_c[:, i, A], forces.of_c[:, i, B], forces.of_c[:, i, LAMBDA])
-        rows.append(give * relaxed - row)
-        right.append(forces.of_c[:, i, ONE] - (not give) * epsilon)
-    for i in range(2):
-        give = name == f"torque limit of finger {i + 1}"
-        row = write(forces.of_tau[:, i, A], forces.of_tau[:, i, B], forces.of_tau[:, i, LAMBDA])
-        high = (not give) * tau_limit[i]
-        rows += [row - give * relaxed, -row - give * relaxed]
-        right += [high - forces.of_tau[:, i, ONE], high + forces.of_tau[:, i, ONE]]
-    equal = np.zeros((nodes + 1, last + 1))
-    for k, step in enumerate(steps):
-        equal[k, [k, k + 1]] = -step
-        equal[k, [nodes + k, nodes + k + 1]] = -1.0, 1.0
-    equal[nodes - 1, [0, 1]] = -1.0, 1.0
-    equal[nodes, [nodes - 2, nodes - 1]] = -1.0, 1.0
-    free_range: Any = (None, None)
-    rest: Any = (0.0, 0.0)
-    b_range = [rest, *[(0.0, None)] * (nodes - 2), rest]
-    sign = -1.0 if name == "epsilon" else 1.0
-    result = linprog(
-        sign * np.eye(last + 1)[last],
-        A_ub=np.vstack(rows),
-        b_ub=np.concatenate(right),
-        A_eq=equal,
-        b_eq=np.zeros(nodes + 1),
-        bounds=[free_range] * nodes + b_range + [free_range] * nodes + [(0.0, None)],
-    )
-    return float(result.x[last]) if result.success else None
-
-
-@pytest.mark.parametrize(
-    "phase, limits",
-    [
-        (1, {"epsilon": 1.0}),
-        (4, {"torque limit of finger 1": 0.3}),
-        (4, {"torque limit of finger 1": 0.7, "epsilon": 0.4}),
-        (4, {"torque limit of finger 1": 0.3, "torque limit of finger 2": 0.05}),
-    ],
-)
-def test_advice_is_that_of_a_linear_program(phase: int, limits: dict[str, float]) -> None:
-    problem = edited(limits, viscous=0.0)
-    advised = read_advice(ask(phase, viscous=0.0, **limits))
-    curve = trace_phases(problem)[phase - 1]
-    exact = {name: relax_by_linear_program(curve, problem.epsilon, name) for name in LIMITS}
-    assert set(advised) == {name for name, value in exact.items() if value is not None}
-    for name, value in advised.items():
-        least = exact[name]
-        assert least is not None
-        # Rounded outwards, with some room for what is between nodes.
-        if name == "epsilon":
-            assert 0.97 * least <= value <= least
-        else:
-            assert least <= value <= 1.03 * least
 
 
 def test_phases_that_impacts_join_are_advised_together() -> None:
@@ -603,40 +528,6 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
     assert plan_path(curves[0], 0.05, options, 1, advised["duration"]).value > 0.05 * (1 - 1e-6)
 
 
-def bound(toy: Toy) -> LowerBound:
-    with toy.in_place():
-        found = bound_least_time([toy.curve], toy.epsilon)
-    assert found is not None
-    return found
-
-
-STEP = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
-CLOSED = [
-    (Toy(constant(1.0)), math.sqrt(2.0)),
-    (Toy(constant(1.0), length=0.03), 2 * math.sqrt(0.03 / LIMIT)),
-    (Toy(constant(1.0, 1.0)), 2 / math.sqrt(LIMIT - EPSILON)),
-    (Toy(constant(1.0), speed_limit=(0.3, np.inf)), 1 / 0.3 + 0.3 / LIMIT),
-    (Toy(constant(1.0), speed_limit=(1.2, np.inf)), 1 / 1.2 + 1.2 / LIMIT),
-    (Toy(constant(1.0), speed_limit=(1.6, np.inf)), math.sqrt(2.0)),
-    (Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing()),
-    (
-        Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,)),
-        (2 * STEP[0] - STEP[1]) / LIMIT + STEP[1] / (LIMIT / 2),
-    ),
-    (Toy(constant(1.0, 0.0, 0.1)), find_time_viscous(0.1)),
-    (Toy(constant(1.0, 0.0, 0.5)), find_time_viscous(0.5)),
-    (Toy(constant(1.0, 0.0, 3.0)), find_time_viscous(3.0)),
-]
-
-
-@pytest.mark.parametrize("case", range(len(CLOSED)))
-def test_closed_forms_are_bounded_closely(case: int) -> None:
-    toy, exact = CLOSED[case]
-    found = bound(toy)
-    assert exact * (1 - 1e-6) < found.value <= exact * (1 + 1e-9)
-    assert 0 <= found.error < 1e-7 * exact
-
-
 def test_two_bounds_are_one() -> None:
     half = Toy(constant(1.0, 0.5, 0.2))
     with half.in_place():
@@ -650,50 +541,6 @@ def test_no_motion_has_no_bound() -> None:
     toy = Toy(constant(1.0, 50.0))
     with toy.in_place():
         assert bound_least_time([toy.curve], toy.epsilon) is None
-
-
-@pytest.mark.parametrize("phase", [0, 2])
-def test_any_costate_gives_a_lower_bound(curves: tuple[Curve, ...], phase: int) -> None:
-    """Whatever p and p' are, no motion within the limits has less than H in the integrand."""
-    curve, rng = curves[phase], np.random.default_rng(phase)
-    count = 4000
-    s = rng.uniform(0, curve.length, count)
-    segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
-    point = curve.evaluate(s)
-    signs = (np.array([getattr(p, name) for p in curve.segments]) for name in ("Xi", "sigma"))
-    directions = Directions(*(sign[segment] for sign in signs))
-    forces = inverse(curve.formation, *point[:3], directions)
-    a, b = rng.uniform(-20, 20, count), 4 * rng.uniform(0, 1, count) ** 3
-    squeeze = rng.uniform(-10, 10, count)
-    rates = point.z_s[:, 3:] * np.sqrt(b)[:, None]
-    y = np.hstack([forces.c(a, b, squeeze), forces.tau(a, b, squeeze), rates])
-    limits = make_limits(curve.formation, EPSILON)
-    kept = (limits.find_slack(y @ limits.rows.T) >= 0).all(axis=1)
-    assert kept.sum() > 100
-    rows = find_limits(curve, EPSILON, point, segment)
-    p = rng.normal(0, 0.05, count) * (rng.uniform(0, 1, count) > 0.1)
-    slope = rng.normal(0, 2, count)
-    value = 1 / np.sqrt(b) - slope * b - 2 * p * a
-    least = find_least(rows, p, slope)
-    assert (value - least)[kept].min() >= -1e-9
-
-
-@pytest.mark.parametrize("phase", [0, 2, 4])
-def test_plans_come_near_the_bound(curves: tuple[Curve, ...], phase: int) -> None:
-    found = bound_least_time([curves[phase]], EPSILON)
-    assert found is not None and found.error < 3e-8 * found.value
-    plan = plan_path(curves[phase], EPSILON, PlanOptions(intervals=80), 1)
-    # What is asked of the defaults: 5e-4. The bound is good to its error.
-    assert -1e-7 < plan.value / found.value - 1 < 2e-4
-
-
-def test_plans_of_a_chain_come_near_the_bound() -> None:
-    problem = problem_of(IMPACTS)
-    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
-    found = bound_least_time(chain.continuous_curves, EPSILON)
-    assert found is not None
-    plans = chain.plan(EPSILON, PlanOptions(intervals=80))
-    assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < 5e-4
 
 
 def test_the_bound_shares_nothing_with_the_nlp() -> None:
