@@ -178,10 +178,9 @@ class Bench:
         self.simulations += 1
         simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
-        pauses = {name: simulation.list_pauses(name, arrival, end) for name in names}
         parted = {
-            name: max((b - a for a, b in intervals), default=0.0)
-            for name, intervals in pauses.items()
+            name: max((b - a for a, b in simulation.list_pauses(name, arrival, end)), default=0.0)
+            for name in names
         }
         worst = max(parted, key=parted.__getitem__)
         if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:

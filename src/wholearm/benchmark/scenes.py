@@ -184,9 +184,8 @@ def _draw_leg(
 
 def _distance(piece: Piece, here: Array, size: Array) -> float:
     """Distance of a pose from a border, x over the radius of gyration, phi in radians."""
-    points = np.column_stack(
-        piece.track.pose(np.linspace(piece.places[0], piece.places[-1], 3 * PLACES))
-    )
+    places = np.linspace(piece.places[0], piece.places[-1], 3 * PLACES)
+    points = np.column_stack(piece.track.pose(places))
     return float(np.hypot(*((points - here) / size).T).min())
 
 

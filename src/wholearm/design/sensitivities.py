@@ -48,6 +48,7 @@ Terms = list[tuple[str, str, float]]
 """Parts of a Lagrangian, or of a value: phases and limit that they come from, and how much."""
 Evaluate = Callable[[Problem, Array], tuple[Terms, Array]]
 """Terms of blocks for another problem, from a configuration (5,), and where they end."""
+Way = tuple[str, float, Evaluate]  # a method, its relative change of a number, and what it takes
 ACCURACY = 1e-6  # of the plans: at 1e-4 the derivative by friction_palm of heptagon is 2 % off
 STEP, WIDE = 1e-4, 2.5e-3  # relative changes of a number, for Lagrangians and solved problems
 LEAST = 1e-2  # size that a number counts as having, over the scene's unit
@@ -330,7 +331,7 @@ def find_sensitivities(
         plans = plan_blocks(changed, trace_phases(changed), options, lambda text: None).plans
         return [(names_of[k], "", plan.value) for k, plan in enumerate(plans, 1)], problem.start
 
-    ways: list[tuple[str, float, Evaluate]] = [("differences", WIDE, solve)]
+    ways: list[Way] = [("differences", WIDE, solve)]
     try:
         if multipliers:
             ways.insert(0, ("multipliers", STEP, find_lagrangian(planning)))
@@ -350,22 +351,18 @@ def find_sensitivities(
 
 
 def _find_one(
-    problem: Problem,
-    goal: Objective,
-    parts: tuple[str, ...],
-    ways: Sequence[tuple[str, float, Evaluate]],
-    parameter: Parameter,
+    problem: Problem, goal: Objective, parts: Sequence[str], ways: Sequence[Way], each: Parameter
 ) -> Sensitivity:
     """The sensitivity to one number, in the first way in which a side of it can be evaluated."""
-    size, fault = max(abs(parameter.value), LEAST * parameter.scale), ""
-    about = parameter.name, parameter.value, parameter.unit
+    size, fault = max(abs(each.value), LEAST * each.scale), ""
+    about = each.name, each.value, each.unit
     for method, step, evaluate in ways:
         sides, note = list[tuple[float, Terms]](), ""
         for change, text in ((step, "with less only: "), (-step, "with more only: "), (0.0, "")):
             if not change and len(sides) != 1:
                 continue
             try:
-                changed = parameter.set(problem, parameter.value + change * size)
+                changed = each.set(problem, each.value + change * size)
                 sides.append((change * size, evaluate(changed, changed.start)[0]))
             except (WholearmError, ValueError) as error:
                 note, fault = f"{text}{error}", str(error)
