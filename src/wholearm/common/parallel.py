@@ -53,7 +53,9 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) -> list[_T]:
+def share(
+    tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = (), order: Sequence[int] = ()
+) -> list[_T]:
     """Results of tasks, in their order.
 
     Processes are forked on Linux alone, where libraries bear it, if this one may have children and
@@ -65,6 +67,7 @@ def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) ->
     tasks  without arguments. What they return has to be picklable.
     jobs   most processes, this one included
     known  what results may refer to: they then have these very objects
+    order  numbers of all tasks as they are begun by several processes, if not in their order
     """
     global _sharing
     count = min(jobs, len(tasks)) - 1
@@ -73,7 +76,7 @@ def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) ->
     _sharing, children = True, list[tuple[BaseProcess, Connection]]()
     source, sink = os.pipe()
     try:
-        os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
+        os.write(sink, b"".join(k.to_bytes(2, "big") for k in order or range(len(tasks))))
         os.close(sink)
         for _ in range(count):
             children.append(_start(tasks, source, known))

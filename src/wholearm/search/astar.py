@@ -18,7 +18,7 @@ from itertools import count, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
-from ..common.signals import beat
+from ..common.signals import Reporter, beat
 from ..contacts.elemental import Contact
 from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
@@ -350,21 +350,26 @@ class RoutePlanner:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
         options, coarse = options.scale_ranges(problem.ranges), self.roadmap.coarse_plans
-        tasks = list[Task[Any]]()
-        for part in split_route(route.edges):
+        tasks, parts = list[Task[Any]](), split_route(route.edges)
+        report(f"planning {len(parts)} parts of the route")
+        # Several processes would tell their progress at once.
+        tell = report if self.jobs == 1 else Reporter(None)
+        for part in parts:
             edges = [(edge, coarse[edge][0] if edge.in_cell else None) for edge in part]
             begin = replace(problem, start=part[0].start.z)
             # Coarse plans of other motors are no guesses.
-            tasks.append(partial(plan_part, begin, edges, options, report, problem is self.problem))
-        parts, enough = len(tasks), BEYOND * self.estimate(route)
+            tasks.append(partial(plan_part, begin, edges, options, tell, problem is self.problem))
+        enough = BEYOND * self.estimate(route)
         if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
             tasks.append(partial(bound_borders, self.search, enough))
-        results = self._share(tasks)
-        for bound in results[parts:]:
+        # Parts through cells take longest.
+        along = [k < len(parts) and not parts[k][0].in_cell for k in range(len(tasks))]
+        results = self._share(tasks, sorted(range(len(tasks)), key=along.__getitem__))
+        for bound in results[len(parts) :]:
             self._bound = enough, bound
         planned = list[PlannedPhase]()
-        for result in results[:parts]:
+        for result in results[: len(parts)]:
             if isinstance(result, Lost):
                 return result
             planned += result
@@ -451,8 +456,8 @@ class RoutePlanner:
         for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
-    def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
-        return share(tasks, self.jobs, (self.problem, self.problem.scene))
+    def _share(self, tasks: Sequence[Task[T]], order: Sequence[int] = ()) -> list[T]:
+        return share(tasks, self.jobs, (self.problem, self.problem.scene), order)
 
     def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> CoarsePlan | None:
         """Plan an edge that leaves its border at another place, or in motion."""
