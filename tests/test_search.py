@@ -165,7 +165,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
         file.write_bytes(damaged)
         assert load_roadmap(folder, "one") is None
-    with pytest.raises(InputError, match=f"{file.name}: cannot be made: File exists"):
+    with pytest.raises(InputError, match=f"{file.name}: cache: cannot be made: File exists"):
         find_route(read({"flush": 0, "x": 0.03}), cache=file)
 
 

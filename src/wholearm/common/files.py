@@ -99,12 +99,12 @@ def read_json(path: str) -> Any:
         raise InputError(path, "", text) from None
 
 
-def make_folder(path: str) -> None:
-    """Make a folder if it is not there; an `InputError` if it cannot be made."""
+def make_folder(path: str, key: str = "") -> None:
+    """Make a folder if it is not there; an `InputError` that names the key if it cannot be made."""
     try:
         os.makedirs(path, exist_ok=True)
     except OSError as error:
-        raise InputError(path, "", f"cannot be made: {error.strerror}") from None
+        raise InputError(path, key, f"cannot be made: {error.strerror}") from None
 
 
 def _is_special(target: str) -> bool:

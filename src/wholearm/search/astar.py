@@ -351,7 +351,7 @@ class RoutePlanner:
             problem, options = free_torques(problem, options)
         options, coarse = options.scale_ranges(problem.ranges), self.roadmap.coarse_plans
         tasks, parts = list[Task[Any]](), split_route(route.edges)
-        report(f"planning {len(parts)} parts of the route")
+        report(f"planning the route, in parts: {len(parts)}")
         # Several processes would tell their progress at once.
         tell = report if self.jobs == 1 else Reporter(None)
         for part in parts:

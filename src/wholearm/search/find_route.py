@@ -99,7 +99,7 @@ def find_route(
             reason = "is missing; allowed is flush or phi_deg, and x"
             raise InputError(problem.source, "goal", reason)
         if cache is not None:
-            make_folder(str(cache))
+            make_folder(str(cache), "cache")
         key = describe_key(problem, plan_options)
         roadmap = get_roadmap(problem, plan_options, key, cache)
         before, start, spent = list[Answer](), problem.start, 0.0
