@@ -207,26 +207,30 @@ def plan_part(
     edges    with coarse plans of those through cells
     guessed  whether these are the initial guesses
     """
-    phases, owners, z = list[Phase](), list[int](), problem.start
+    owners, borders = list[int](), dict[int, Edge]()  # the latter by their phase
     steps = [step for edge, coarse in edges for step in (coarse or edge).steps]
     guesses = dict[int, list[PhasePlan[TimeMotion]]]()  # by the last phase of their block
     for number, (edge, coarse) in enumerate(edges):
-        owners += [number] * len(edge.steps)
-        along = make_phases(problem, steps)[len(phases) : len(owners)]
+        owners += [number] * len((coarse or edge).steps)
         if coarse:
-            z, guesses[along[-1].index] = end_of(coarse.begun[-1])[0], coarse.begun
-        elif len(along) == 1:
-            along = [_aim(along[0], z, edge)]
-        phases += along
-    single = replace(problem, phases=tuple(phases), goals=())
+            guesses[len(owners) - 1] = coarse.begun
+        elif len(edge.steps) == 1 and not edge.in_cell:
+            borders[len(owners) - 1] = edge
+    single = replace(problem, phases=tuple(make_phases(problem, steps)), goals=())
     planning = Planning(single, (), options, (), sketches=True)
     try:
         with unadvised(), name_source(problem.source):
             for block in split_blocks(single):
                 known, guess = None, guesses.get(block[-1].index)
+                start = planning.blocks[-1].end if planning.blocks else problem.start
                 if guess and guessed:
-                    start = planning.blocks[-1].end if planning.blocks else problem.start
                     known = BlockPlan(block, start, list(guess), None, coarse=True)
+                if block[0].index in borders:
+                    # From where the edge before lands: goal 18 of the corpus.
+                    aimed = [*single.phases]
+                    aimed[block[0].index] = _aim(block[0], start, borders[block[0].index])
+                    single = replace(single, phases=tuple(aimed))
+                    planning = replace(planning, problem=single)
                 planning = plan_next(planning, known, report)
     except (WholearmError, np.linalg.LinAlgError) as error:
         failed = owners[len(planning.plans)]
@@ -237,7 +241,7 @@ def plan_part(
         first = failed - (failed > 0 and edges[failed - 1][0].in_cell)
         lost.edges = tuple(edge for edge, _ in edges[first : failed + 1])
         return lost
-    pairs = zip(phases, planning.plans, strict=True)
+    pairs = zip(single.phases, planning.plans, strict=True)
     return [(pin_landing(phase, end_of(plan)[0]), plan) for phase, plan in pairs]
 
 
