@@ -68,7 +68,7 @@ from .system import (
 )
 
 # Longest time between a reversal and its torque step where contacts press too little meanwhile:
-# errors of the phases before make it 2.3e-5 in phase 11 of query 1. Contacts open by less than 1e-7.
+# errors of the phases before make it 2.3e-5 in phase 11 of query 1. Contacts open less than 1e-7.
 BRIDGED = 2e-4
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
 _OUTCOMES = {
