@@ -627,7 +627,8 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
     best = find_best(scene, phase, epsilon, z, ends)
     text = f"{at}: of {best.curves} curves to {len(ends)} places the best has {best.margin:.3g}"
     if best.margin > CLEAR:
-        return Verdict("refuted", text)
+        unique = uniqueness_ratio(scene, phase, best.z, np.gradient(best.z, axis=0)).min()
+        return Verdict("close" if unique < UNIQUENESS.default else "refuted", text)
     # Where the best of many curves misses limits by so much, surely none keeps them.
     return Verdict("confirmed" if best.curves and best.margin < -0.02 else "close", text)
 
