@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from functools import cache, lru_cache
 
@@ -21,6 +22,7 @@ from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
+from wholearm.problem.read import build_problem
 
 
 @cache
@@ -312,3 +314,43 @@ until = "v2-palm"
 """  # noqa: E501
 """A flip in four phases of one motion: a link passes over its tip to an edge, and then lies on it,
 by an impact that gives the tip a rate away from the edge."""
+
+
+@cache
+def fading() -> Problem:
+    """A small hexagon: its motion of the largest margin along a curve ends slowly."""
+    text = """
+        epsilon = 0.000704
+        object.mass = 0.00834
+        object.vertices = [[0.0068, -0.000469], [0.00489, 0.00278], [-0.00306, 0.00417],
+            [-0.0068, 0.0006], [-0.00506, -0.00265], [0.00226, -0.00434]]
+        fingers.1 = {base = [0.00659, -0.00168], length = 0.00747, radius = 0.0017,
+            inertia = 1.04e-9, viscous = 5.25e-7, dry = 3.97e-9, torque_limit = 0.000929}
+        fingers.2 = {base = [-0.0108, 0.000832], length = 0.00957, radius = 0.000594,
+            inertia = 1.6e-6, viscous = 8.83e-7, dry = 5.49e-6, torque_limit = 0.00338}
+        friction = {palm = 0.111, finger1 = 0.0, finger2 = 0.0735}
+        start = {flush = 4, x = -0.00318}
+        phases = [{contacts = ["v4-palm", "v5-palm", "v0-finger1", "v3-finger2"],
+            until = {x = -0.004}}]
+    """
+    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+
+
+@cache
+def turning() -> Problem:
+    """A tall pentagon between pointed tips, one of which turns onto a vertex with its link."""
+    text = """
+        epsilon = 0.00852
+        object.mass = 0.301
+        object.vertices = [[-0.125, 0.925], [-0.089, 0.249], [0.0861, -0.814], [0.14, -0.808],
+            [0.0173, 0.265]]
+        fingers.1 = {base = [0.82, 0.0434], length = 1.54, radius = 0.0, inertia = 0.000156,
+            viscous = 0.0108, dry = 0.00427, torque_limit = 32.0}
+        fingers.2 = {base = [-0.922, -0.247], length = 1.74, radius = 0.0, inertia = 0.00823,
+            viscous = 2.05e-05, dry = 0.655, torque_limit = 36.3}
+        friction = {palm = 0.619, finger1 = 0.932, finger2 = 0.743}
+        start = {flush = 2, x = 0.597}
+        phases = [{contacts = ["v2-palm", "e4-tip1", "e1-tip2"],
+            until = {contact = "v4-finger1", x = 0.424}}]
+    """
+    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))

@@ -20,11 +20,10 @@ from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
 from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
-from scenes import box, tip
+from scenes import box, fading, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm import Problem
-from wholearm.benchmark.scenes import draw_case
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve, directions_of
@@ -617,7 +616,7 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
 
 def test_torques_follow_a_motion_that_fades() -> None:
     """Half of the last interval's time passes on a hundredth of its way."""
-    problem = build_problem(draw_case(1128, 462).table)
+    problem = fading()
     trajectory = solve(problem, "margin", replay=False).trajectory
     (motion,), torque = trajectory.motions, trajectory.torque
     t = np.linspace(0.0, motion.duration, 2001)

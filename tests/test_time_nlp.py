@@ -13,11 +13,10 @@ import pytest
 from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
 from rows import each
-from scenes import roll
+from scenes import roll, turning
 from shipped import HEPTAGON
 from timed import Sampler, drive, landing
 from wholearm import Formation, Objective, Scene, load
-from wholearm.benchmark.scenes import draw_case
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.sharing import Batch
 from wholearm.geometry.curve import Curve, tangent_basis
@@ -45,7 +44,6 @@ from wholearm.planning.time_domain.time_nlp import (
     pack,
     point_kernel,
 )
-from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
 
 
@@ -491,7 +489,7 @@ def test_the_tangent_basis_is_what_contacts_leave_free(contacts: int) -> None:
 
 def test_a_contact_is_gained_where_the_motion_ends() -> None:
     """A pointed tip comes to a vertex along the edge, or turns onto it with its link."""
-    problem = build_problem(draw_case(1128, 412).table)
+    problem = turning()
     (phase,), start = problem.phases, problem.start
     slip, rows = phase.formation.evaluate_slip(start[None])[0], list[int | None]()
     for ending in list_ends(phase):
