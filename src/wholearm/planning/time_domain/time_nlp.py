@@ -838,9 +838,11 @@ def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     count = sum(len(build_limits(contact, formation.scene)) for contact in formation.contacts)
     ends = [k for k in gaining if k < count]
-    values = formation.evaluate_limits(z[None])[0]
+    if len(gaining) == len(ends) == 1:
+        return ends[0]
     near = 1e-3 * formation.scene.scales.length
-    return next((k for k in ends if values[k] < near or len(gaining) == len(ends) == 1), None)
+    values = formation.evaluate_limits(z[None])[0] if ends else ()
+    return next((k for k in ends if values[k] < near), None)
 
 
 @share
