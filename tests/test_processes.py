@@ -12,6 +12,7 @@ import signal
 import stat
 import subprocess
 import sys
+import textwrap
 import threading
 import time
 import zipfile
@@ -27,13 +28,10 @@ import pytest
 import wholearm
 from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of, verified
 from tiny_study import die_once
-from wholearm.cli.command import hasten
 from wholearm.common import files as archive
-from wholearm.common import signals as interrupts
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
 from wholearm.common.parallel import Processes, can_fork, count_cores, run_all, share
-from wholearm.common.signals import check, guard, held
 from wholearm.planning.nlp import STOPPED, Solver
 from wholearm.simulation.simulate import simulate
 
@@ -226,156 +224,119 @@ def write(path: Path, text: str = "whole") -> None:
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
+def run_signalled(work: str, path: Path, number: signal.Signals = signal.SIGINT) -> tuple[int, str]:
+    """Exit status and errors of a command that has a function `stop`, which sends it a signal."""
+    command = [sys.executable, "-c", COMMAND.format(work=textwrap.indent(work, "    "))]
+    run = subprocess.run([*command, str(number.value)], **PIPES, cwd=path, timeout=60)
+    return run.returncode, run.stderr
+
+
+COMMAND = """
+import functools, os, signal, sys, time
+from pathlib import Path
+from wholearm.cli.command import hasten
+from wholearm.common.files import together, write_whole
+from wholearm.common.signals import beat, guard, held, yielding
+
+stop = functools.partial(signal.raise_signal, int(sys.argv[1]))
+
+def write(stream):
+    stream.write(b"half")
+    stream.flush()
+    stop()
+
+def run():
+{work}
+    return 0
+
+guard(run)
+"""
+
+HALF = """
+try:
+    write_whole("out", write)
+finally:
+    Path("reached").touch()
+"""
+HELD = """
+with held():
+    stop()
+    Path("one").touch()
+    with held():
+        Path("two").touch()
+Path("three").touch()
+"""
+TOGETHER = """
+with together():
+    write_whole("one", lambda stream: stream.write(b"whole"))
+    write_whole("two", write)
+"""
+
+
 @BOTH
+@pytest.mark.parametrize(
+    ("work", "left"), [(HALF, []), (HELD, ["one", "two"]), (TOGETHER, ["one"])]
+)
 def test_a_signal_ends_a_command(
-    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+    work: str, left: list[str], number: signal.Signals, tmp_path: Path
 ) -> None:
-    reached: list[str] = []
-
-    def run() -> int:
-        try:
-            signal.raise_signal(number)
-            reached.append("after the signal")
-        finally:
-            reached.append("cleaned up")
-        return 0
-
-    before = signal.getsignal(number)
-    assert guard(run, lambda: reached.append("tidied")) == 128 + number
-    assert reached == ["cleaned up", "tidied"]
+    """Files are whole, or those of before; signals wait for what belongs together."""
+    if work is TOGETHER:
+        (tmp_path / "one").write_text("before")
     word = "interrupted" if number == signal.SIGINT else "terminated"
-    assert capsys.readouterr().err == f"wholearm: {word}\n"
-    assert signal.getsignal(number) is before
-    assert guard(lambda: 3) == 3
+    assert run_signalled(work, tmp_path, number) == (128 + number, f"wholearm: {word}\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    if work is TOGETHER:
+        assert (tmp_path / "one").read_text() == "before"
 
 
-def swallow() -> int:
-    try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        print("whatever is said about it", file=sys.stderr)
-    return 0
+YIELDS = """
+try:
+    with yielding():
+        stop()
+        {then}
+except KeyboardInterrupt:
+    hasten()
+"""
 
 
-def turn_into_another() -> int:
-    try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        raise ImportError from None
-    return 0
-
-
-@pytest.mark.parametrize("run", [swallow, turn_into_another])
-def test_a_swallowed_interrupt_counts(
-    run: Callable[[], int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert guard(run) == 130
-    assert capsys.readouterr().err == "wholearm: interrupted\n"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@BOTH
+@pytest.mark.parametrize("then", ["beat()", "pass"])
 def test_a_search_says_that_it_plans_unless_it_is_terminated(
-    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+    number: signal.Signals, then: str, tmp_path: Path
 ) -> None:
-    def search() -> int:
-        try:
-            with interrupts.yielding():
-                signal.raise_signal(number)
-        except KeyboardInterrupt:
-            hasten()
-        return 0
-
-    assert guard(search) == (0 if number is signal.SIGINT else 128 + number)
-    assert ("again to stop" in capfd.readouterr().err) == (number is signal.SIGINT)
+    status, errors = run_signalled(YIELDS.format(then=then), tmp_path, number)
+    assert status == (0 if number == signal.SIGINT else 128 + number)
+    assert ("again to stop" in errors) == (number == signal.SIGINT)
 
 
-def test_no_file_appears_after_a_swallowed_interrupt(tmp_path: Path) -> None:
-    def run() -> int:
-        swallow()
-        with pytest.raises(KeyboardInterrupt):
-            check()
-        write(tmp_path / "late")
-        return 0
-
-    assert guard(run) == 130
-    assert list(tmp_path.iterdir()) == []
+def test_a_second_interrupt_ends_a_search(tmp_path: Path) -> None:
+    status, errors = run_signalled(YIELDS.format(then="stop()"), tmp_path)
+    assert (status, errors) == (130, "wholearm: interrupted\n")
 
 
-def test_a_signal_waits_for_files_that_belong_together(tmp_path: Path) -> None:
-    def run() -> int:
-        with held():
-            signal.raise_signal(signal.SIGINT)
-            (tmp_path / "one").touch()
-            (tmp_path / "two").touch()
-        (tmp_path / "three").touch()
-        return 0
-
-    assert guard(run) == 130
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+def test_an_ignored_signal_stays_ignored(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run_signalled("stop()", tmp_path) == (0, "")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     one.write_text("before")
-
-    def run() -> int:
-        with together():
-            write(one)
-            assert one.read_text() == "before"
-            signal.raise_signal(signal.SIGINT)
-            write(two)
-        return 0
-
-    assert guard(run) == 130
-    assert [path.name for path in tmp_path.iterdir()] == ["one"]
-    assert one.read_text() == "before"
+    with pytest.raises(KeyboardInterrupt), together():
+        write(one)
+        assert one.read_text() == "before"
+        raise KeyboardInterrupt
+    assert (one.read_text(), len(list(tmp_path.iterdir()))) == ("before", 1)
     with together():
         write(one)
         write(two)
         assert not two.exists()
     assert (one.read_text(), two.read_text()) == ("whole", "whole")
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_an_ignored_signal_stays_ignored() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        assert guard(swallow) == 0
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-SWALLOWS = """
-import sys, tempfile, time
-from wholearm.common.files import write_whole
-from wholearm.common.signals import guard
-
-def write(stream):
-    stream.write(b"half")
-    stream.flush()
-    print("ready", flush=True)
-    while True:
-        try:
-            time.sleep(60)
-        except KeyboardInterrupt:
-            print("swallowed", file=sys.stderr)
-
-sys.exit(guard(lambda: write_whole(sys.argv[1], write) or 0))
-"""
-
-
-@BOTH
-def test_a_command_that_goes_on_is_ended(number: signal.Signals, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", SWALLOWS, str(tmp_path / "out")]
-    with subprocess.Popen(command, **PIPES) as process:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-        assert len(os.listdir(tmp_path)) == 1
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == 128 + number
-    word = "interrupted" if number == signal.SIGINT else "terminated"
-    assert errors == f"wholearm: {word}\n"
-    assert os.listdir(tmp_path) == []
 
 
 STARTED = "import wholearm.__main__ as m; print('ready', flush=True); m.run()"

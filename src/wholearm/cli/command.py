@@ -30,7 +30,7 @@ import wholearm
 from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
 from ..common.fields import Range, keys_of, read_options
 from ..common.files import require_ending, require_writable, together, write_text
-from ..common.signals import check, guard, listen
+from ..common.signals import listen, on_end
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
 
@@ -307,13 +307,8 @@ options as of `read_options`."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    command_line = sys.argv[1:] if arguments is None else arguments
-    return guard(lambda: _run(command_line), clear_progress)
-
-
-def _run(given: Sequence[str]) -> int:
     try:
-        words = prepare(given)
+        words = prepare(sys.argv[1:] if arguments is None else arguments)
         options = build_parser(words).parse_args(words)
         with progress_log():
             status: int = options.run(options)
@@ -484,6 +479,9 @@ def clear_progress() -> None:
     """Remove the progress line."""
     if sys.stderr.isatty():
         show_progress()("")
+
+
+on_end(clear_progress)
 
 
 def require_output(path: str | None, *endings: str) -> None:
@@ -874,9 +872,7 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def hasten() -> None:
-    """Say that the best route so far is being planned; raises where the command was terminated."""
-    # After SIGTERM nothing is planned any more.
-    check()
+    """Say that the best route so far is being planned."""
     clear_progress()
     _complain("planning the best route; again to stop")
 

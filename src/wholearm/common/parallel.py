@@ -23,7 +23,6 @@ import sys
 import threading
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
@@ -36,14 +35,13 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from .errors import InputError
-from .signals import WATCHER
+from .signals import beat, held
 
 _T = TypeVar("_T")
 Task = Callable[[], _T]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _sharing = False
-_starting = threading.Lock()
 
 
 def count_cores() -> int:
@@ -84,6 +82,8 @@ def share(
         for _, answers in children:
             # A child that was ended, or met an error, sends nothing.
             with suppress(EOFError, OSError):
+                while not answers.poll(0.1):
+                    beat()
                 answer = io.BytesIO(answers.recv_bytes())
                 results |= _Unpickler(answer, known).load()
         return [results[k] if k in results else task() for k, task in enumerate(tasks)]
@@ -99,11 +99,10 @@ def share(
 
 def can_fork() -> bool:
     """Whether this process may have children that go on from where it is."""
-    mine = (threading.current_thread().name, WATCHER)
     return (
         sys.platform == "linux"
         and not mp.current_process().daemon
-        and all(thread.name in mine for thread in threading.enumerate())
+        and threading.active_count() == 1
     )
 
 
@@ -117,9 +116,7 @@ def _start(
     process = context.Process(target=_serve, args=arguments, daemon=True)
     try:
         # No signal may meet the child before it has said what it does about it.
-        with _blocked(*_SIGNALS), warnings.catch_warnings():
-            # Of other threads there is the one that waits for signals, and holds nothing.
-            warnings.simplefilter("ignore", DeprecationWarning)
+        with _blocked(*_SIGNALS):
             process.start()
     finally:
         far.close()
@@ -159,7 +156,6 @@ def _serve(
 ) -> None:
     """Take tasks for as long as there are any, and send what has come of them."""
     # The parent alone answers an interrupt, and ends its children.
-    signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
@@ -342,7 +338,8 @@ class _Spawned(SpawnProcess):
         # The first process starts this one, too, which would unblock SIGINT.
         if sys.platform != "win32":
             resource_tracker.ensure_running()
-        with _starting, _blocked(signal.SIGINT):
+        # What a signal ends has to be known by then; and one is started at a time.
+        with held(), _blocked(signal.SIGINT):
             main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
             try:
                 super().start()
