@@ -65,12 +65,13 @@ def share(
     tasks  without arguments. What they return has to be picklable.
     jobs   most processes, this one included
     known  what results may refer to: they then have these very objects
-    order  numbers of all tasks as they are begun by several processes, if not in their order
+    order  numbers of all tasks as they are begun, if not in their order
     """
     global _sharing
     count = min(jobs, len(tasks)) - 1
     if count < 1 or _sharing or not can_fork():
-        return [task() for task in tasks]
+        made = {k: tasks[k]() for k in order or range(len(tasks))}
+        return [made[k] for k in range(len(tasks))]
     _sharing, children = True, list[tuple[BaseProcess, Connection]]()
     source, sink = os.pipe()
     try:

@@ -29,6 +29,7 @@ from .edge_plans import (
     CoarsePlan,
     Lost,
     PlannedPhase,
+    RoutePart,
     list_printed,
     look_ahead,
     plan_coarsely,
@@ -49,7 +50,7 @@ STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
 GAIN = 0.998  # largest ratio of durations that counts as a gain
 INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-AGREES = 1 + 1e-4  # ratio of a plan of printed phases to those of the edges, above which another
+AGREES = 1 + 1e-3  # ratio of a plan of printed phases to those of the edges, above which another
 # initial guess is tried
 TRIED = 6  # most routes without a plan, beyond those asked for
 BEYOND = 1.1  # largest estimate of a route over that of the best one
@@ -350,30 +351,43 @@ class RoutePlanner:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
         options, coarse = options.scale_ranges(problem.ranges), self.roadmap.coarse_plans
-        tasks, parts = list[Task[Any]](), split_route(route.edges)
+        parts = [
+            tuple((edge, coarse[edge][0] if edge.in_cell else None) for edge in part)
+            for part in split_route(route.edges)
+        ]
         report(f"planning the route, in parts: {len(parts)}")
         # Several processes would tell their progress at once.
-        tell = report if self.jobs == 1 else Reporter(None)
-        for part in parts:
-            edges = [(edge, coarse[edge][0] if edge.in_cell else None) for edge in part]
-            begin = replace(problem, start=part[0].start.z)
+        tell, lost = report if self.jobs == 1 else Reporter(None), list[Lost]()
+
+        def plan_one(part: RoutePart) -> list[PlannedPhase] | Lost | None:
+            """Plan a part; None if another one has no plan."""
+            begin = replace(problem, start=part[0][0].start.z)
             # Coarse plans of other motors are no guesses.
-            tasks.append(partial(plan_part, begin, edges, options, tell, problem is self.problem))
+            made = None if lost else plan_part(begin, part, options, tell, problem is self.problem)
+            lost.extend([made] if isinstance(made, Lost) else ())
+            return made
+
+        known = self.roadmap.part_plans
+        keys = [(tuple((e, c and c.duration) for e, c in part), repr(options)) for part in parts]
+        new = [k for k, key in enumerate(keys) if key not in known]
+        tasks: list[Task[Any]] = [partial(plan_one, parts[k]) for k in new]
         enough = BEYOND * self.estimate(route)
         if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
             tasks.append(partial(bound_borders, self.search, enough))
         # Parts through cells take longest.
-        along = [k < len(parts) and not parts[k][0].in_cell for k in range(len(tasks))]
+        along = [k < len(new) and not parts[new[k]][0][0].in_cell for k in range(len(tasks))]
         results = self._share(tasks, sorted(range(len(tasks)), key=along.__getitem__))
-        for bound in results[len(parts) :]:
+        for bound in results[len(new) :]:
             self._bound = enough, bound
+        known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
         planned = list[PlannedPhase]()
-        for result in results[: len(parts)]:
-            if isinstance(result, Lost):
-                return result
-            planned += result
-        reached = sum(plan.motion.duration for _, plan in planned)
+        for key in keys:
+            made = known.get(key)
+            if isinstance(made, Lost):
+                return made
+            planned += made or []
+        reached = sum(one.motion.duration for _, one in planned)
         before: tuple[Phase, ...] = ()
         if self.before:
             before, reached = self.before.problem.phases, self.before.duration + reached

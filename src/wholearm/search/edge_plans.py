@@ -67,6 +67,10 @@ class CoarsePlan(NamedTuple):
     begun: list[PhasePlan[TimeMotion]]
 
 
+RoutePart = Sequence[tuple[Edge, CoarsePlan | None]]
+"""Edges of a route, with plans of those through cells."""
+
+
 def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
     """Steps as phases."""
     return [
@@ -195,12 +199,12 @@ def split_route(edges: Sequence[Edge]) -> list[list[Edge]]:
 @exclusive
 def plan_part(
     problem: Problem,
-    edges: Sequence[tuple[Edge, CoarsePlan | None]],
+    edges: RoutePart,
     options: PlanOptions,
     report: Callable[[str], None],
     guessed: bool = True,
 ) -> list[PlannedPhase] | Lost:
-    """Plans of edges one after the other from the problem's start, or why there are none.
+    """Rough plans of edges one after the other from the problem's start, or why there are none.
 
     Parameters
     ----------
@@ -217,7 +221,7 @@ def plan_part(
         elif len(edge.steps) == 1 and not edge.in_cell:
             borders[len(owners) - 1] = edge
     single = replace(problem, phases=tuple(make_phases(problem, steps)), goals=())
-    planning = Planning(single, (), options, (), sketches=True)
+    planning = Planning(single, (), options.roughen(), (), sketches=True)
     try:
         with unadvised(), name_source(problem.source):
             for block in split_blocks(single):

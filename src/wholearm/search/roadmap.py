@@ -33,7 +33,7 @@ from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
-from .edge_plans import CoarsePlan
+from .edge_plans import CoarsePlan, Lost, PlannedPhase
 from .edges import (
     Blocked,
     BorderEdge,
@@ -139,6 +139,7 @@ class Roadmap:
     ----------
     plans         plans of phases, or why there are none; see `edge_plans`
     coarse_plans  plans of single edges through cells, the best first; empty if there are none
+    part_plans    plans of parts of routes
     refined       edges whose place on the border has been optimized
     """
 
@@ -152,6 +153,7 @@ class Roadmap:
         self._cells: dict[Key, list[Edge]] = {}
         self.plans: dict[object, Plan | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
+        self.part_plans: dict[object, list[PlannedPhase] | Lost] = {}
         self._releases: dict[BorderEdge, list[Edge]] = {}
         self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
 

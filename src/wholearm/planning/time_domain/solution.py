@@ -121,6 +121,7 @@ class TimeSearch:
     price: Price | None = None
     ample: float = math.inf  # normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
+    searched: bool = False  # whether the modes of the first guess are those of a mode search
     tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
     @staticmethod

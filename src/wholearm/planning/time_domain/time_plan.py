@@ -278,19 +278,21 @@ def solve_guesses(
 
     If the first ones fail, `refuse` may raise an error that says why.
     """
-    coarse = list[_Named]()
+    coarse, lost = list[_Named](), list[_Named]()
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
         solution = solve_coarse(search, guess)
+        if solution.success and any(is_same(solution, other) for other, _ in lost):
+            continue
         if solution.success:
             coarse.append((solution, guess.name))
         elif refuse and not coarse and guess.name == NEAREST:
             refuse()
         if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
-            best, coarse = _refine_best(search, coarse), []
-            if best:
+            if best := _refine_best(search, coarse):
                 return best
+            lost, coarse = lost + coarse, []
     return _refine_best(search, coarse)
 
 
@@ -309,9 +311,15 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
     return solution
 
 
+def is_same(one: TimeSolution, other: TimeSolution) -> bool:
+    """Whether two solutions are the same but for rounding: their cost and their modes."""
+    close = math.isclose(one.cost, other.cost, rel_tol=1e-6)
+    return close and sign_sequence(one.stages) == sign_sequence(other.stages)
+
+
 def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
     """Whether a solution suggests other contact modes."""
-    if not search.options.mode_search or search.has_ample(solution):
+    if not search.options.mode_search or search.searched or search.has_ample(solution):
         return False
     sequence = sign_sequence(solution.stages)
     return any(sign_sequence(moved) != sequence for moved in list_neighbours(search, solution))
@@ -332,7 +340,7 @@ def _refine_best(search: TimeSearch, coarse: Sequence[_Named]) -> _Named | None:
 def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     """Search modes, choose a free end, refine, and hold torques over control periods."""
     searched = solution
-    if search.options.mode_search and not search.has_ample(solution):
+    if search.options.mode_search and not (search.searched or search.has_ample(solution)):
         searched = improve(search, solution)
     if search.only_begins:
         return searched
@@ -380,11 +388,11 @@ def hold_torques(
         most = 150 if equal else ITERATIONS  # phases 2 to 4 of a pentagon take 70 at 2 ms
         return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=most)
 
-    def hold(period: float) -> TimeSolution | None:
+    def hold(period: float, most: int) -> TimeSolution | None:
         stages = free
-        if sum(count_periods(free, period)) > 100:
+        if most > 1 and sum(count_periods(free, period)) > 100:
             # A plan with periods twice as long is one with these: 2 to 4 of a pentagon at 1 ms.
-            coarse = hold(2 * period)
+            coarse = hold(2 * period, most)
             stages = coarse.stages if coarse else free
         for _ in range(4):  # most times that numbers of periods change
             solution = solve(stages, period, 1.0, equal=True)
@@ -394,7 +402,7 @@ def hold_torques(
             if count_periods(before, period) == count_periods(stages, period):
                 break
         stretch = 1.0
-        for _ in range(6):  # most durations; phase 3 of query 0 takes 5 at 5 ms
+        for _ in range(most):  # durations
             solution = solve(stages, period, stretch, equal=False)
             while solution.success and (shorter := drop_periods(solution.stages)):
                 fewer = held.solve(shorter, most=ITERATIONS)
@@ -407,15 +415,12 @@ def hold_torques(
             stretch += max(0.02, period / sum(stage.guess.duration for stage in stages))
         return None
 
-    for share in (1.0, 0.5, 0.2):
-        solution = hold(share * scene.control_period)
-        if solution and share == 1:
-            return solution
-        if solution:
-            break
-    quick = replace(problem.scene, control_period=share * problem.scene.control_period)
-    numbers = [phase.number for phase in phases]
-    raise refuse_motors(problem.scene, quick if solution else None, numbers)
+    if solution := hold(scene.control_period, 6):  # phase 3 of query 0 takes 5 at 5 ms
+        return solution
+    # One duration each: six take two minutes more for phase 5 of query 1, and find nothing either.
+    share = next((part for part in (0.5, 0.2) if hold(part * scene.control_period, 1)), None)
+    quick = replace(problem.scene, control_period=share * scene.control_period) if share else None
+    raise refuse_motors(problem.scene, quick, [phase.number for phase in phases])
 
 
 def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
@@ -511,8 +516,7 @@ def _resume(
     if not (coarse.complete or coarse.sequences > 1):
         return solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
     search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
-    search = replace(search, options=replace(search.options, mode_search=False))
-    return solve_guesses(search, [guess])
+    return solve_guesses(replace(search, searched=True), [guess])
 
 
 def _list_slow(
