@@ -392,7 +392,7 @@ class RoutePlanner:
         if self.before:
             before, reached = self.before.problem.phases, self.before.duration + reached
         best: Plan | str = ""
-        # Without guesses: query 61, whose guess leads to worse contact modes.
+        # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
             phases = (*before, *list_printed(scene, planned, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
