@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count, pairwise
+from itertools import count, pairwise, takewhile
 from typing import Any, NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
@@ -350,7 +350,35 @@ class RoutePlanner:
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
-        options, coarse = options.scale_ranges(problem.ranges), self.roadmap.coarse_plans
+        planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
+        if isinstance(planned, Lost):
+            return planned
+        reached = sum(one.motion.duration for _, one in planned)
+        before: tuple[Phase, ...] = ()
+        if self.before:
+            before, reached = self.before.problem.phases, self.before.duration + reached
+        best: Plan | str = ""
+        # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
+        for guesses in (True, False) if alike else (False,) if slow else (False, True):
+            phases = (*before, *list_printed(scene, planned, guesses))
+            phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
+            printed = replace(self.problem, phases=phases, goals=())
+            plan = plan_phases(printed, self.options, self.roadmap.plans, report)
+            if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
+                best = plan
+            if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
+                break
+        return best
+
+    def _plan_parts(
+        self,
+        route: Route,
+        problem: Problem,
+        options: PlanOptions,
+        report: Callable[[str], None],
+    ) -> list[PlannedPhase] | Lost:
+        """Rough plans of a route's parts, one after the other, or why one has none."""
+        coarse = self.roadmap.coarse_plans
         parts = [
             tuple((edge, coarse[edge][0] if edge.in_cell else None) for edge in part)
             for part in split_route(route.edges)
@@ -369,40 +397,25 @@ class RoutePlanner:
 
         known = self.roadmap.part_plans
         keys = [(tuple((e, c and c.duration) for e, c in part), repr(options)) for part in parts]
-        new = [k for k, key in enumerate(keys) if key not in known]
+        # Parts through cells take longest, and the first of them without a plan ends this.
+        along = [not part[0][0].in_cell for part in parts]
+        order = sorted(range(len(parts)), key=along.__getitem__)
+        wanted = takewhile(lambda k: not isinstance(known.get(keys[k]), Lost), order)
+        new = [k for k in wanted if keys[k] not in known]
         tasks: list[Task[Any]] = [partial(plan_one, parts[k]) for k in new]
         enough = BEYOND * self.estimate(route)
         if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
             tasks.append(partial(bound_borders, self.search, enough))
-        # Parts through cells take longest.
-        along = [k < len(new) and not parts[new[k]][0][0].in_cell for k in range(len(tasks))]
-        results = self._share(tasks, sorted(range(len(tasks)), key=along.__getitem__))
+        begun = sorted(range(len(tasks)), key=lambda k: k < len(new) and along[new[k]])
+        results = self._share(tasks, begun)
         for bound in results[len(new) :]:
             self._bound = enough, bound
         known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
-        planned = list[PlannedPhase]()
-        for key in keys:
-            made = known.get(key)
-            if isinstance(made, Lost):
+        for k in order:
+            if isinstance(made := known.get(keys[k]), Lost):
                 return made
-            planned += made or []
-        reached = sum(one.motion.duration for _, one in planned)
-        before: tuple[Phase, ...] = ()
-        if self.before:
-            before, reached = self.before.problem.phases, self.before.duration + reached
-        best: Plan | str = ""
-        # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
-        for guesses in (True, False) if alike else (False,) if slow else (False, True):
-            phases = (*before, *list_printed(scene, planned, guesses))
-            phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
-            printed = replace(self.problem, phases=phases, goals=())
-            plan = plan_phases(printed, self.options, self.roadmap.plans, report)
-            if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
-                best = plan
-            if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
-                break
-        return best
+        return [pair for key in keys for pair in known[key] if not isinstance(pair, str)]
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
