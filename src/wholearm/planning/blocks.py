@@ -165,16 +165,22 @@ def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
 
-    An error is raised only if it does not depend on where exactly the block before ends.
+    Blocks along curves after it have none, as they will begin elsewhere: they are traced alone. An
+    error is raised only if it does not depend on where exactly the block before ends.
     """
     blocks, coarse = split_blocks(planning.problem), planning
     over_time = [not runs_along_curves(block, planning.options) for block in blocks]
     scene = planning.problem.scene
     if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
         return planning
-    for index in range(len(blocks)):
+    for index, block in enumerate(blocks):
         try:
-            coarse = plan_next(coarse, None, report, coarse=True)
+            if any(over_time[:index]) and not over_time[index]:
+                z = coarse.blocks[-1].end
+                traced = BlockPlan(block, z, [], trace_block(coarse, block, z), coarse=True)
+                coarse = replace(coarse, blocks=(*coarse.blocks, traced))
+            else:
+                coarse = plan_next(coarse, None, report, coarse=True)
         except WholearmError as error:
             short = error.shortfalls if isinstance(error, InfeasibleError) else ()
             # A better plan of earlier phases does not help against large violations.
@@ -232,15 +238,10 @@ def plan_block(
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    problem, stored = planning.problem, planning.curves
+    problem = planning.problem
     if not runs_along_curves(block, options):
         return _plan_over_time(planning, block, z, options, over_time), None
-    curves = []
-    for phase in block:
-        traced, later = phase.index < len(stored), problem.phases[phase.index + 1 :]
-        curves.append(stored[phase.index] if traced else trace_phase(phase, z, later))
-        z = curves[-1].end
-    chain = make_sequence(block, curves)
+    chain = trace_block(planning, block, z)
     if problem.scene.has_slow_motors:
         return plan_slowly(planning, chain, options), chain
     plans: Plans = []
@@ -248,6 +249,16 @@ def plan_block(
         with charge(part.phases[0].number):
             plans += part.plan(problem.epsilon, options, planning.allow(part.phases))
     return plans, chain
+
+
+def trace_block(planning: Planning, block: Sequence[Phase], z: Array) -> ImpactSequence:
+    """Curves of a block from `z`, of shape (5,)."""
+    stored, curves = planning.curves, list[Curve]()
+    for phase in block:
+        known, later = phase.index < len(stored), planning.problem.phases[phase.index + 1 :]
+        curves.append(stored[phase.index] if known else trace_phase(phase, z, later))
+        z = curves[-1].end
+    return make_sequence(block, curves)
 
 
 def _plan_over_time(
