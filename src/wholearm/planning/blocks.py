@@ -90,7 +90,6 @@ class Planning:
     allowed: Sequence[float] = ()
     least: Plans = field(default_factory=list)  # these plans; blocks end where they do
     ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
-    sketches: bool = False  # whether least times-to-go are those of a speed sweep
     # [N]: by how much c_n of blocks, by their indices, have to exceed epsilon, if at all
     more: dict[int, float] = field(default_factory=dict)
 
@@ -395,7 +394,7 @@ def look_ahead(
     ):
         return None
 
-    if planning.sketches and options.goal is Objective.TIME:
+    if options.goal is Objective.TIME and len(following) == 1:
         return estimate_time_to_go(phase, problem.epsilon)
 
     def value(z: Array) -> float:

@@ -221,7 +221,7 @@ def plan_part(
         elif len(edge.steps) == 1 and not edge.in_cell:
             borders[len(owners) - 1] = edge
     single = replace(problem, phases=tuple(make_phases(problem, steps)), goals=())
-    planning = Planning(single, (), options.roughen(), (), sketches=True)
+    planning = Planning(single, (), options.roughen(), ())
     try:
         with unadvised(), name_source(problem.source):
             for block in split_blocks(single):
