@@ -23,6 +23,7 @@ from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import main
 from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
 from wholearm.common.fields import key as declare_key
+from wholearm.geometry.tracing import trace_phases
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.plan import solve
 from wholearm.problem import read
@@ -45,6 +46,7 @@ from wholearm.results.adopt import describe_origin
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
+WHOLE = tomllib.loads(TEXT) | {"uncertainty": {"mass": 0.1}}
 
 
 def read_edited(edit: Edit) -> Problem:
@@ -58,8 +60,7 @@ def both(*edits: Edit) -> Edit:
 
 
 def ending(phase: int, until: object, end: str) -> Edit:
-    """An edit of the end of a phase."""
-    return lambda table: table["phases"][phase].update(until=until, end=end)
+    return both(put(f"phases.{phase}.until", until), put(f"phases.{phase}.end", end))
 
 
 def test_heptagon_is_read() -> None:
@@ -179,7 +180,6 @@ THREE = {
     [
         (put("phases.1.contact", []), "phases[2].contact", "did you mean 'contacts'"),
         (put("name", 3), "name", "not a string"),
-        (put("epsilon", -0.1), "epsilon", ">= 0"),
         (put("fingers_collide", 0), "fingers_collide", "0 given; allowed are true and false"),
         (put("fingers.2.base", [0.09, 0]), "fingers.1.base", "not to the right"),
         (put("start.flush", 0.0), "start.flush", "0 to 6"),
@@ -195,7 +195,6 @@ THREE = {
         (put("phases.3.until", {"contact": 3}), "phases[4].until", "3 is not a contact"),
         (put("phases.3.until", {"contact": "v4-finger1", "x": 99.0}), "phases[4].until", "99"),
         (put("phases.3", THREE), "phases[4].until", "gives 3 conditions; allowed are 2"),
-        (put("phases.3.until", {"x": math.nan}), "phases[4].until", "finite"),
         (put("phases.3.until", {"phi_deg": "1"}), "phases[4].until", "'1'"),
         (put("phases.3", guessing() | {"guess": []}), "phases[4].guess", "contact modes"),
         (put("phases.3", guessing() | {"guess": [3]}), "phases[4].guess[1]", "not a table"),
@@ -204,35 +203,21 @@ THREE = {
         (put("phases.3", guessing((0, "phi_deg", "1"))), "phases[4].guess[1].phi_deg", "'1'"),
         (put("phases.3", guessing((0, "signs", "-+ +-"))), "phases[4].guess[1].signs", "3 of -"),
         (put("phases.3", guessing((0, "sign", 1))), "phases[4].guess[1].sign", "'signs'"),
-        (
-            put("phases.3", guessing() | {"contacts": ["v1-palm rolling", *LATER]}),
-            "phases[4].guess[1].signs",
-            "v1-palm rolls: allowed is 0",
-        ),
-        (
-            both(
-                put("friction.finger2", 0.0),
-                put("phases.3.contacts", ["v1-palm", "v0-finger2 rolling", "v3-finger1"]),
-            ),
-            "phases[4].contacts",
-            "v0-finger2 cannot roll without friction, and friction.finger2 is 0",
-        ),
+        (put("phases.3", guessing() | {"contacts": ["v1-palm rolling", *LATER]}),
+         "phases[4].guess[1].signs", "v1-palm rolls: allowed is 0"),
+        (both(put("friction.finger2", 0.0),
+              put("phases.3.contacts", ["v1-palm", "v0-finger2 rolling", "v3-finger1"])),
+         "phases[4].contacts", "v0-finger2 cannot roll without friction, and friction.finger2 is"),
         (ending(0, "v3-finger1", "bang"), "phases[1].end", "allowed are 'rest', 'smooth',"),
         (ending(4, {"x": 0.0}, "impact"), "phases[5].end", "'impact' given, but the last"),
         (ending(4, {"x": 0.0}, "smooth"), "phases[5].end", "the last phase ends at rest"),
         (ending(0, {"x": 0.02}, "impact"), "phases[1].end", "x = 0.02 m, not a contact that is"),
         (ending(0, "v3-palm", "impact"), "phases[1].end", "but phase 2 does not have v3-palm"),
         (ending(2, "v3-palm", "smooth"), "phases[3].end", "but phase 4 has v0-finger2 too"),
-        (
-            both(put("phases.0.end", "impact"), put("phases.1.contacts.1", "v4-finger1")),
-            "phases[1].end",
-            "'impact' given, but phase 2 has v4-finger1 too",
-        ),
-        (
-            both(put("phases.0.end", "impact"), lambda table: table["phases"][0].pop("until")),
-            "phases[1].until",
-            "is missing; only a phase with end = 'smooth' has none",
-        ),
+        (both(put("phases.0.end", "impact"), put("phases.1.contacts.1", "v4-finger1")),
+         "phases[1].end", "'impact' given, but phase 2 has v4-finger1 too"),
+        (both(put("phases.0.end", "impact"), lambda table: table["phases"][0].pop("until")),
+         "phases[1].until", "is missing; only a phase with end = 'smooth' has none"),
         (put("object.mass", 1e308), "object.mass", "1e+308 given; allowed are 1e-06 to 1e+06 kg"),
         (put("object.inertia", 1e-8), "object.inertia", "times uniform density"),
         (put("gravity", 1e-9), "gravity", "allowed are 0.001 to"),
@@ -244,8 +229,9 @@ THREE = {
         (put("fingers.1.torque_limit", 1e308), "fingers.1.torque_limit", "times m g length"),
         (put("epsilon", 1e308), "epsilon", "times what presses at most"),
         (put("start.x", -1e308), "start.x", "times the object's size"),
+        (put("goal", {"flush": 6}), "goal", "given with [[phases]]"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
     """More of it is in the corpus, with whole messages."""
     with pytest.raises(InputError) as caught:
@@ -255,11 +241,8 @@ def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
 
 
 def test_ends_are_read() -> None:
-    def edit(table: dict[str, Any]) -> None:
-        table["phases"][0]["end"], table["phases"][1]["end"] = "impact", "rest"
-
-    ends = [phase.end for phase in read_edited(edit).phases]
-    assert ends == [End.IMPACT, *4 * [End.REST]]
+    problem = read_edited(both(put("phases.0.end", "impact"), put("phases.1.end", "rest")))
+    assert [phase.end for phase in problem.phases] == [End.IMPACT, *4 * [End.REST]]
 
 
 @each(
@@ -312,29 +295,17 @@ def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
     assert caught.value.key == "start.x" and "allowed is 0 or more" in caught.value.problem
     # It is said where the hand would close, and there it does.
     text = caught.value.problem.split("; at that angle the hand closes for x ")[1]
-    for own in re.findall(r"-?[\d.]+", text):
-
-        def move(table: dict[str, Any], x: float = float(own)) -> None:
-            cross(table)
-            table["start"]["x"] = x
-            del table["phases"]
-
-        assert read_edited(move).start[0] == float(own)
-
-    def pass_by(table: dict[str, Any]) -> None:
-        cross(table)
-        table["fingers_collide"] = False
-        table["phases"] = table["phases"][1:2]
-
-    assert read_edited(pass_by).start[0] == 0.0
+    bare = both(cross, put("phases", []))
+    for own in map(float, re.findall(r"-?[\d.]+", text)):
+        assert read_edited(both(bare, put("start.x", own))).start[0] == own
+    passing = both(cross, put("fingers_collide", False), put("phases", WHOLE["phases"][1:2]))
+    assert read_edited(passing).start[0] == 0.0
 
 
 def test_the_first_phase_may_let_go_of_what_touches() -> None:
-    def edit(table: dict[str, Any]) -> None:
-        table["phases"][0]["contacts"].remove("v0-palm")
-
-    first = read_edited(edit).phases[0].formation
-    assert first.names == ("v1-palm", "v2-finger1", "v5-finger2")
+    contacts = ["v1-palm", "v2-finger1", "v5-finger2"]
+    first = read_edited(put("phases.0.contacts", contacts)).phases[0].formation
+    assert first.names == tuple(contacts)
 
 
 @pytest.mark.parametrize(
@@ -358,9 +329,8 @@ def test_a_problem_that_is_saved_loads_as_the_same(
 
 def test_default_ranges_follow_the_size() -> None:
     problem = problem_of(HEPTAGON)
-    length = problem.scene.scales.length
     assert problem.ranges["start_x"] == pytest.approx(2e-4, rel=0.2)
-    assert problem.ranges["start_x"] / length == pytest.approx(6e-3)
+    assert problem.ranges["start_x"] / problem.scene.scales.length == pytest.approx(6e-3)
     assert problem.with_(uncertainty={"start_x": 1e-3}).ranges["start_x"] == 1e-3
 
 
@@ -432,23 +402,18 @@ def test_wrong_values_have_the_messages_of_files(
 
 
 def test_what_only_objects_can_say_wrongly() -> None:
-    given = problem_of(BOX)
-    first = given.phases[0]
+    given, sideways = problem_of(BOX), Until(coordinate="y", value=0.1)
+    first = replace(given.phases[0], until=sideways)
     for changes, text in (
         ({"start": given.start[:4]}, "start: .* is not a list of 5 numbers"),
         ({"phases": given.phases[1:]}, r"phases\[1\]: has the index 1; .* makes it 0"),
-        (
-            {"phases": (replace(first, until=Until(coordinate="y", value=0.1)),)},
-            r"phases\[1\].until: 'y' given; allowed are 'x' and 'phi'",
-        ),
+        ({"phases": (first,)}, r"phases\[1\].until: 'y' given; allowed are 'x' and 'phi'"),
     ):
         with pytest.raises(InputError, match=text):
             rebuild(given, **changes)
 
 
 def test_a_start_that_no_file_can_say_leaves_the_table_empty() -> None:
-    from wholearm.geometry.tracing import trace_phases
-
     given = problem_of(HEPTAGON)
     start = trace_phases(given)[3].end
     made = rebuild(given, start=start, phases=(replace(given.phases[4], index=0),))
@@ -478,22 +443,21 @@ def get_stiffness(problem: Problem) -> list[Any]:
     return [getattr(finger, "stiffness") for finger in problem.scene.fingers]  # noqa: B009
 
 
-def test_a_new_key_is_read_and_left_out(table: dict[str, Any]) -> None:
-    assert get_stiffness(build_problem(table)) == [0.0, 0.0]
-    table["fingers"]["2"]["stiffness"] = 1
-    assert get_stiffness(build_problem(table)) == [0.0, 1.0]
+def test_a_new_key_is_read_left_out_changed_and_written(
+    table: dict[str, Any], tmp_path: Path
+) -> None:
+    problem = build_problem(table)
+    assert get_stiffness(problem) == [0.0, 0.0]
+    assert get_stiffness(problem.with_(stiffness=0.5)) == [0.5, 0.5]
+    save(problem.with_(stiffness2=0.7), str(tmp_path / "sprung.toml"))
+    assert get_stiffness(read_problem(str(tmp_path / "sprung.toml"))) == [0.0, 0.7]
 
 
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
         ("stiffness", -1.0, "fingers.1.stiffness: -1.0 is not a number >= 0"),
-        ("stiffness", "soft", "fingers.1.stiffness: 'soft' is not a number"),
-        (
-            "stiffness",
-            5.0,
-            r"5 given; allowed are 0.002 to 4 N m/rad \(0.001 to 2 times the torque limit\)",
-        ),
+        ("stiffness", 5.0, r"are 0.002 to 4 N m/rad \(0.001 to 2 times the torque limit\)"),
         ("stifness", 1.0, "fingers.1.stifness: unknown key; did you mean 'stiffness'?"),
     ],
 )
@@ -515,18 +479,8 @@ def test_schema_page_and_docstring_know_it(table: dict[str, Any]) -> None:
     assert "Spring of the joint" in (SprungFinger.__doc__ or "")
 
 
-def test_changes_by_name_and_files_know_it(table: dict[str, Any], tmp_path: Path) -> None:
-    problem = build_problem(table)
-    assert get_stiffness(problem.with_(stiffness=0.5)) == [0.5, 0.5]
-    changed = problem.with_(stiffness2=0.7)
-    assert get_stiffness(changed) == [0.0, 0.7]
-    save(changed, str(tmp_path / "sprung.toml"))
-    assert get_stiffness(read_problem(str(tmp_path / "sprung.toml"))) == [0.0, 0.7]
-
-
 jsonschema = pytest.importorskip("jsonschema")
 SCHEMA = build_schema()
-WHOLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8")) | {"uncertainty": {"mass": 0.1}}
 PARTS = SCHEMA["properties"]
 TABLES: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     "": (SCHEMA, lambda table: table),
@@ -687,10 +641,7 @@ def test_another_shape_closes_the_fingers_anew(heptagon: Problem) -> None:
 @each(
     "changes, message",
     [
-        (
-            {"fricton": 0.2},
-            "fricton: unknown name; did you mean 'friction'? allowed are actuator_lag, ",
-        ),
+        ({"fricton": 0.2}, "fricton: unknown name; did you mean 'friction'? allowed are "),
         ({"torque_limit": None}, "fingers.1.torque_limit: is missing"),
         ({"friction": {"palm": 0.1}}, "friction.finger1: is missing"),
         ({"object.masss": 1}, "object.masss: unknown key; did you mean 'mass'?"),
@@ -709,13 +660,6 @@ def test_what_a_file_may_not_say_no_change_may(
     assert str(caught.value).startswith(f"{HEPTAGON}: {message}")
 
 
-def test_a_problem_without_a_table_cannot_be_changed_by_name(heptagon: Problem) -> None:
-    bare = replace(heptagon, start=heptagon.start + 0.1 * np.eye(5)[2])
-    assert replace(bare, epsilon=0.1).table == {}
-    with pytest.raises(InputError, match="has no table"):
-        bare.with_(epsilon=0.1)
-
-
 def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> None:
     check_table(replace(heptagon, phases=heptagon.phases[:2]))
     box = read_problem(str(BOX))
@@ -727,8 +671,10 @@ def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> N
     assert [entry.get("end") for entry in passing.table["phases"]] == ["smooth"] * 4 + [None]
     moved = heptagon.with_(x=0.04)
     check_table(replace(heptagon, start=moved.start))
-    tilted = heptagon.start + 0.1 * np.eye(5)[2]
-    assert replace(heptagon, start=tilted).table == {}
+    tilted = replace(heptagon, start=heptagon.start + 0.1 * np.eye(5)[2])
+    assert tilted.table == {} and replace(tilted, epsilon=0.1).table == {}
+    with pytest.raises(InputError, match="has no table"):
+        tilted.with_(epsilon=0.1)
 
 
 def least_time(folder: Path, corners: int, size: float, mass: float | None = None) -> float:
@@ -809,12 +755,6 @@ def test_goals_are_read_and_written(given: object, goals: tuple[Goal, ...]) -> N
 def test_other_goals_are_refused(given: Any, text: str) -> None:
     with pytest.raises(InputError, match=text):
         read_file(given)
-
-
-def test_phases_and_goals_exclude_each_other() -> None:
-    table = tomllib.loads(HEPTAGON.read_text())
-    with pytest.raises(InputError, match=r"goal: given with \[\[phases\]\]"):
-        build_problem({**table, "goal": {"flush": 6}})
 
 
 def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:
