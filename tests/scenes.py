@@ -354,3 +354,26 @@ def turning() -> Problem:
             until = {contact = "v4-finger1", x = 0.424}}]
     """
     return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+
+
+@cache
+def reversing() -> Problem:
+    """A decagon that leaves a border where its motion turns back."""
+    text = """
+        epsilon = 0.3034
+        object.mass = 20.97
+        object.vertices = [[-0.1425, 0.3496], [-0.3208, 0.199], [-0.3765, -0.02752],
+            [-0.2884, -0.2436], [-0.09018, -0.3666], [0.1425, -0.3496], [0.3208, -0.199],
+            [0.3765, 0.02752], [0.2884, 0.2436], [0.09018, 0.3666]]
+        fingers.1 = {base = [0.5257, -0.05926], length = 1.127, inertia = 13.59,
+            viscous = 0.00709, dry = 12.67, torque_limit = 2190.0}
+        fingers.2 = {base = [-0.6599, -0.09831], length = 0.9127, inertia = 0.0001223,
+            viscous = 0.01548, dry = 2.911, torque_limit = 848.9}
+        friction = {palm = 0.2212, finger1 = 0.1368, finger2 = 0.0138}
+        start = {flush = 4, x = -0.3186}
+        phases = [{contacts = ["v4-palm", "v5-palm", "v8-finger1", "v2-finger2"],
+            until = {x = -0.4109}, end = "smooth"},
+            {contacts = ["v5-palm", "v8-finger1", "v2-finger2"],
+            until = {x = -0.3511, phi_deg = -6.519}}]
+    """
+    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
-from scenes import measure_fingers
+from scenes import measure_fingers, reversing
 from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from wholearm import Problem
 from wholearm.common.arrays import Array
@@ -288,3 +288,11 @@ def test_the_keys_that_keep_a_phase_from_a_plan_are_named(heptagon: Problem) -> 
     neither = explain_motors(problem.scene, problem.phases[:1], [], SolverError(error))
     assert str(neither) == f"{error}; so it is {keys}"
     assert str(explain_motors(heptagon.scene, (), [], SolverError(error))) == error
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_a_border_is_left_where_the_motion_turns_back(objective: str) -> None:
+    """Rounding has the replay turn back some nanometres before the end of the first phase."""
+    plan = solve(reversing(), objective, accuracy=1e-2).trajectory
+    before, after = plan.at(plan.phase_starts[1] + np.array([-1e-4, 1e-4])).z_dot[:, 0]
+    assert before < 0 < after

@@ -557,9 +557,12 @@ class Replay(Run):
             distance = self.distance / self.leg.until_unit
             # Of several breaks as near as that, the nearest is the one at which the phase ends.
             later = self.breaks[self.piece + 2 : self.piece + 3]
-            apart = (later[0] - t) / self.problem.scene.scales.time if len(later) else math.inf
-            early = min(SETTLING, apart / 2)
-            speed = 0.0 if -SETTLING * speed <= distance <= early * speed else math.inf
+            time = self.problem.scene.scales.time
+            early = min(SETTLING, (later[0] - t) / time / 2 if len(later) else math.inf)
+            # Phase 1 of scene 584 of seed 1128 stops there, for the least effort.
+            stops = self._time_to_stop() < SETTLING * time
+            passed = -SETTLING * speed <= distance <= early * speed
+            speed = 0.0 if stops or passed else math.inf
         elif self.phase.end is End.IMPACT and self._strikes():
             coming = self.piece + 1
             speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
@@ -615,7 +618,11 @@ class Replay(Run):
             text = f"{self.leg.limits[reached[0] - limit.start]} {self.when()}"
             self.note(EventKind.LIMIT, text)
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
-        return self.restart(self._find_turning(kinds))
+        turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
+        if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
+            # The same phase, for the least time, turns back 5 nm before its end.
+            return self._reach()
+        return self.restart(turning)
 
     def _reach(self) -> Arrival:
         """The end of the phase is reached while moving."""
