@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+import shipped
 from once import once
 from plane import (
     SQUARE,
@@ -52,18 +53,14 @@ from wholearm.mapping.formation_map import (
 )
 from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning.lower_bound import look_along
-from wholearm.problem.read import build_problem, read_problem
+from wholearm.problem.read import read_problem
+from wholearm.scene.model import Finger
 from wholearm.search.edges import Edge, cut_curve
 from wholearm.search.places import is_at, make_place
 from wholearm.search.roadmap import Roadmap
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 WINDOW = Window((-0.16, 0.16), (np.radians(-75.0), np.radians(30.0)))
-
-
-@pytest.fixture(scope="module")
-def pointed() -> FormationMap:
-    return map_pointed()
 
 
 @once
@@ -73,10 +70,10 @@ def map_pointed() -> FormationMap:
     return build_map(problem, resolution=30, window=WINDOW)
 
 
-@pytest.fixture(scope="module", params=["chart", "pointed"])
+@pytest.fixture(scope="module", params=[shipped.chart, map_pointed])
 def every(request: pytest.FixtureRequest) -> FormationMap:
-    found: FormationMap = request.getfixturevalue(request.param)
-    return found
+    chart: FormationMap = request.param()
+    return chart
 
 
 def gaps(scene: Scene, border_contacts: Any, z: Array) -> Array:
@@ -170,7 +167,9 @@ def test_cells_that_cannot_be_reached_say_why(every: FormationMap) -> None:
         assert finger_gap(scene, z[:3], -code - 1, angles).min() > 0
 
 
-def test_borders_have_four_closed_contacts(every: FormationMap) -> None:
+def test_borders_have_four_closed_contacts_and_edges_flush_on_palm_or_link(
+    every: FormationMap,
+) -> None:
     scene = every.problem.scene
     for border in every.borders:
         assert len(border.contacts) == 4
@@ -180,12 +179,6 @@ def test_borders_have_four_closed_contacts(every: FormationMap) -> None:
         assert (np.diff(coordinate) > 0).all()
         if border.flush is None:
             assert not border.forth.any() and not border.back.any()
-
-
-def test_flush_edges_lie_on_palm_or_link(every: FormationMap) -> None:
-    scene = every.problem.scene
-    for border in every.borders:
-        if border.flush is None:
             continue
         finger, edge = border.flush
         for z in border.z[[0, len(border.z) // 2]]:
@@ -253,9 +246,8 @@ def most_slack(problem: Problem, border: Border, k: int, way: float) -> float | 
     above[:4, :4], above[4:6, 4:6], above[6:, 4:6] = -np.eye(4), np.eye(2), -np.eye(2)
     above[:, 6] = 1.0
     bound = np.concatenate([np.full(4, -problem.epsilon), np.tile(scene.torque_limit, 2)])
-    answer = linprog(
-        [0.0] * 6 + [-1.0], above, bound, equal, right, [(None, None)] * 6 + [(None, 10.0)]
-    )
+    ranges = [(None, None)] * 6 + [(None, 10.0)]
+    answer = linprog([0.0] * 6 + [-1.0], above, bound, equal, right, ranges)
     assert answer.success
     return float(answer.x[-1])
 
@@ -325,25 +317,16 @@ def test_mirrored_problem_has_the_mirrored_map() -> None:
     np.testing.assert_array_equal(one.cell < 0, two.cell[::-1, ::-1] < 0)
 
 
-@pytest.fixture(scope="module")
-def crossed() -> FormationMap:
+def test_places_where_the_fingers_overlap_are_marked() -> None:
     """Long fingers that meet over the hexagon."""
     problem = hexagon((0.19, 0.19), -0.085)
-    return build_map(problem, 90, Window((-0.1, 0.1), (np.radians(-30.0), np.radians(30.0))))
-
-
-def test_places_where_the_fingers_overlap_are_marked(crossed: FormationMap) -> None:
+    crossed = build_map(problem, 90, Window((-0.1, 0.1), (np.radians(-30.0), np.radians(30.0))))
     scene = crossed.problem.scene
     x, phi = (part.ravel() for part in np.meshgrid(crossed.x, crossed.phi))
-    overlap = (measure_fingers(scene, close_fingers(scene, x, phi).z) < 0).reshape(
-        crossed.cell.shape
-    )
-    np.testing.assert_array_equal(crossed.cell == CROSSED, overlap)
+    overlap = measure_fingers(scene, close_fingers(scene, x, phi).z) < 0
+    np.testing.assert_array_equal(crossed.cell.ravel() == CROSSED, overlap)
     assert 20 < overlap.sum() < overlap.size / 4
-
-
-def test_borders_end_where_the_fingers_touch(crossed: FormationMap) -> None:
-    scene = crossed.problem.scene
+    # Borders end where the fingers touch.
     gaps = [measure_fingers(scene, border.z) for border in crossed.borders]
     assert min(gap.min() for gap in gaps) > -1e-9
     ends = [gap[k] for gap in gaps for k in (0, -1)]
@@ -364,9 +347,8 @@ def test_a_route_into_touching_fingers_says_so() -> None:
 def test_the_window_ends_before_the_next_edge_but_one(count: int) -> None:
     angles = np.linspace(0, math.tau, count, endpoint=False)
     corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
-    start = {"flush": 0, "x": 0.0}
-    problem = build_problem({**TABLE, "object": {**TABLE["object"], "vertices": corners.tolist()},
-                             "start": start, "fingers_collide": False, "phases": []})  # fmt: skip
+    changes = {"phases": None, "fingers_collide": False, "start": {"flush": 0, "x": 0.0}}
+    problem = problem_of(HEPTAGON).with_(changes | {"vertices": corners})
     window = choose_window(problem)
     assert len(window.flush_angles(problem.scene)) == 3
     low, high = window.phi
@@ -455,12 +437,8 @@ def approach(rng: np.random.Generator, scene: Scene, finger: int) -> Array:
 
 def limits_of(formation: Formation, finger: int, values: Array) -> dict[str, float]:
     """Values of the limits that are about one finger and the object."""
-    words = f"finger {finger + 1}"
-    return {
-        limit.text: value
-        for limit, value in zip(formation.limits, values.tolist(), strict=True)
-        if words in limit.text
-    }
+    every = zip([limit.text for limit in formation.limits], values.tolist(), strict=True)
+    return {text: value for text, value in every if f"finger {finger + 1}" in text}
 
 
 @pytest.mark.parametrize("finger", [0, 1])
@@ -468,11 +446,7 @@ def limits_of(formation: Formation, finger: int, values: Array) -> dict[str, flo
 def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
     radius: float, finger: int
 ) -> None:
-    """At random all around each other: limits are positive if, and only if, the bodies are apart.
-
-    The object is pushed to within a few millimetres of the link, the distances of which are
-    measured by plain geometry.
-    """
+    """Limits are positive if, and only if, the bodies are apart, as measured by plain geometry."""
     rng = np.random.default_rng([finger, int(1e3 * radius)])
     broken: set[str] = set()
     seen = {True: 0, False: 0}
@@ -543,35 +517,20 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
     assert min(seen.values()) > 10
 
 
-COUNT = 400
+def random_link(rng: np.random.Generator, side: float) -> Finger:
+    base = side * rng.uniform(0.01, 0.1), rng.uniform(-0.05, 0.02)
+    return make_finger(base, rng.uniform(0.05, 0.25), rng.choice([0.0, 0.004, 0.02]))
 
 
-def random_hands(seed: int, count: int = 12) -> list[Scene]:
-    """Hands whose links differ in base, length and radius."""
-    rng = np.random.default_rng(seed)
-    hands = []
-    for _ in range(count):
-        right = make_finger([rng.uniform(0.01, 0.1), rng.uniform(-0.05, 0.02)])
-        left = make_finger([rng.uniform(-0.1, -0.01), rng.uniform(-0.05, 0.02)])
-        fingers = [
-            replace(f, length=rng.uniform(0.05, 0.25), radius=rng.choice([0.0, 0.004, 0.02]))
-            for f in (right, left)
-        ]
-        hands.append(replace(make_scene(SQUARE), fingers=(fingers[0], fingers[1])))
-    return hands
+def random_angles(rng: np.random.Generator, count: int) -> Array:
+    return np.hstack([np.zeros((count, 3)), rng.uniform(-np.pi, np.pi, (count, 2))])
 
 
-def random_angles(seed: int, count: int = COUNT) -> Array:
-    z = np.zeros((count, 5))
-    z[:, 3:] = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 2))
-    return z
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_gap_is_the_distance_or_minus_the_least_push_that_parts(seed: int) -> None:
-    seen = np.zeros(2, dtype=int)
-    for scene in random_hands(seed):
-        z = random_angles(seed)
+def test_the_gap_is_the_distance_or_minus_the_least_push_that_parts() -> None:
+    seen, rng = np.zeros(2, dtype=int), np.random.default_rng(0)
+    for _ in range(36):
+        fingers = random_link(rng, 1.0), random_link(rng, -1.0)
+        scene, z = replace(make_scene(), fingers=fingers), random_angles(rng, 400)
         gap = evaluate_finger_gap(scene, z)
         np.testing.assert_allclose(gap, measure_fingers(scene, z), atol=1e-14)
         crossed = gap < -sum(link.radius for link in scene.fingers)
@@ -597,7 +556,7 @@ def test_the_gap_is_a_limit_of_every_formation() -> None:
         formation = make_formation(scene, names)
         (index,) = [k for k, e in enumerate(formation.limits) if e.text == FINGERS_TOUCH]
         assert formation.limits[index].gained is None
-        z = random_angles(5, 20)
+        z = random_angles(np.random.default_rng(5), 20)
         values = formation.evaluate_limits(z)[:, index]
         np.testing.assert_allclose(values, evaluate_finger_gap(scene, z), atol=ROUNDING)
     passing = make_formation(replace(scene, fingers_collide=False), "v0-palm v1-palm")
@@ -663,14 +622,9 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
 
 def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     problem = problem_of(HEPTAGON)
-    chart = Roadmap(problem, 0.1)
-    place = make_place(problem.scene, problem.start)
+    edges = Roadmap(problem, 0.1).list_along(make_place(problem.scene, problem.start), FAR_GOAL)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
-    assert [
-        edge
-        for edge in chart.list_along(place, FAR_GOAL)
-        if len(edge.steps) > 1 and str(edge.steps[0].until) == "v3-finger1"
-    ] == []
+    assert not any(len(own.steps) > 1 and str(own.steps[0].until) == "v3-finger1" for own in edges)
 
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:
@@ -690,21 +644,17 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
     assert chart.land_at(chart.release(border, borders), Goal(flush=1)) == []
 
 
-CURVES = trace_phases(problem_of(HEPTAGON))
-
-
-def whole_of(curve: Curve) -> Curve:
-    """The curve through a place inside another one, as it is traced both ways from there."""
+@pytest.mark.parametrize("index", [0, 1])
+def test_parts_of_a_joined_curve_are_what_is_traced_from_there(
+    curves: tuple[Curve, ...], index: int
+) -> None:
+    """Joined of the two that are traced both ways from a place inside another one."""
+    curve = curves[index]
     at = curve.evaluate(np.array([0.4 * curve.length]))
     back, forth = (
         trace_curve(curve.formation, at.z[0], sign * at.z_s[0], Until()) for sign in (-1, 1)
     )
-    return join(back, forth)
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_parts_of_a_joined_curve_are_what_is_traced_from_there(index: int) -> None:
-    whole = whole_of(CURVES[index])
+    whole = join(back, forth)
     length = whole.formation.scene.scales.length
     for share in (0.0, 0.3, 0.7, 1.0):
         s = share * whole.length

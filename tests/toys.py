@@ -17,7 +17,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from wholearm.common.arrays import Array
-from wholearm.geometry.curve import Curve, Segment
+from wholearm.geometry.curve import Curve, CurvePoint, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
 from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
@@ -26,28 +26,6 @@ from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.scene.model import Scales
-
-
-class LinePoint(tuple[Array, Array, Array]):
-    """Points of a straight line in place of those of a curve: z, z' and z''."""
-
-    kinematics = None
-
-    @property
-    def z(self) -> Array:
-        """Configurations, shape (n, 5)."""
-        return self[0]
-
-    @property
-    def z_s(self) -> Array:
-        """Their derivatives along the line, shape (n, 5)."""
-        return self[1]
-
-    @property
-    def z_ss(self) -> Array:
-        """Their second derivatives, shape (n, 5)."""
-        return self[2]
-
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
 """Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""
@@ -131,9 +109,10 @@ class Toy:
         return PathForces(C, T)
 
 
-def _evaluate(s: Array) -> LinePoint:
+def _evaluate(s: Array) -> CurvePoint:
     z = np.outer(s, [1.0, 0.0, 0.0, 1.0, 1.0])
-    return LinePoint((z, np.ones_like(z), 0 * z))
+    kinematics: Any = None
+    return CurvePoint(z, np.ones_like(z), 0 * z, kinematics)
 
 
 def constant(Ta: float, Tl: float = 0.0, Tv: float = 0.0) -> Law:
