@@ -316,6 +316,11 @@ until = "v2-palm"
 by an impact that gives the tip a rate away from the edge."""
 
 
+def read_lines(text: str) -> Problem:
+    """The problem of a text in which lines that go on are indented by another four spaces."""
+    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+
+
 @cache
 def fading() -> Problem:
     """A small hexagon: its motion of the largest margin along a curve ends slowly."""
@@ -333,7 +338,7 @@ def fading() -> Problem:
         phases = [{contacts = ["v4-palm", "v5-palm", "v0-finger1", "v3-finger2"],
             until = {x = -0.004}}]
     """
-    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+    return read_lines(text)
 
 
 @cache
@@ -353,7 +358,7 @@ def turning() -> Problem:
         phases = [{contacts = ["v2-palm", "e4-tip1", "e1-tip2"],
             until = {contact = "v4-finger1", x = 0.424}}]
     """
-    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+    return read_lines(text)
 
 
 @cache
