@@ -292,9 +292,7 @@ def test_friction_and_limits_are_free_along_curves(pairs: Pairs, part: str) -> N
         assert_bare(spend(case), TOUCHING, 0)
 
 
-def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
-    pairs: Pairs,
-) -> None:
+def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: Pairs) -> None:
     own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
     full, smooth, free, limited = (
         spend(case) for case in (own[0][1], own[0][0], own[1][0], own[2][1])
@@ -307,9 +305,7 @@ def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
     assert TIME_INTERVALS <= intervals < 2 * TIME_INTERVALS and rest == 0
 
 
-def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
-    pairs: Pairs,
-) -> None:
+def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(pairs: Pairs) -> None:
     tip = pairs["a second freedom"][0]
     (phase,) = tip.problem.phases
     assert (phase.formation.n_contacts, phase.formation.n_rolling) == (3, 1)

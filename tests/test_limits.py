@@ -36,9 +36,7 @@ from wholearm.planning.explain import change_limit, list_shortfalls
 from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import choose_sampling, prepare
-from wholearm.planning.path_domain.path_motion import (
-    PathMotion,
-)
+from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
 from wholearm.planning.time_domain.stage import Stage

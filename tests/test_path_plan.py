@@ -31,19 +31,11 @@ from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, inverse
 from wholearm.planning import lower_bound
 from wholearm.planning.blocks import make_sequence
-from wholearm.planning.lower_bound import (
-    LowerBound,
-    bound_least_time,
-    look_along,
-)
+from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_nlp import (
-    LimitShape,
-    PathNLP,
-    build_path_nlp,
-)
+from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve

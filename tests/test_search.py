@@ -45,16 +45,8 @@ from wholearm.planning.phase_plan import PhasePlan, end_of
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
-from wholearm.search.astar import (
-    FINEST,
-    RefinedPath,
-    ReleaseSearch,
-    RouteSearch,
-    bound_borders,
-)
-from wholearm.search.astar import (
-    Route as SearchRoute,
-)
+from wholearm.search.astar import FINEST, RefinedPath, ReleaseSearch, RouteSearch, bound_borders
+from wholearm.search.astar import Route as SearchRoute
 from wholearm.search.cuts import (
     describe_block,
     edge_changed,
@@ -74,12 +66,7 @@ from wholearm.search.edge_plans import (
     split_route,
 )
 from wholearm.search.edges import Edge
-from wholearm.search.find_route import (
-    find_route,
-    format_phases,
-    load_roadmap,
-    store_roadmap,
-)
+from wholearm.search.find_route import find_route, format_phases, load_roadmap, store_roadmap
 from wholearm.search.places import make_place, require_reach
 from wholearm.search.roadmap import Roadmap, can_start
 
