@@ -43,11 +43,6 @@ def slid() -> Plan:
     return solve(replace(whole, phases=phases), intervals=20, replay=False)
 
 
-def shorten(problem: Problem) -> Problem:
-    """A problem like the hexagon's with the same phases only."""
-    return replace(problem, phases=problem.phases[:3])
-
-
 @cache
 def make_way(solid: bool) -> Problem:
     """Finger 2 pushes the hexagon below a free finger 1, which has to make way for the other."""

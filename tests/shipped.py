@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from once import once
 from wholearm import FormationMap, Plan, Problem, Report, Trajectory, build_map, load, verify
+from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
 
 FOLDER = Path(__file__).parents[1] / "problems"
@@ -33,6 +35,13 @@ Edit = Callable[[dict[str, Any]], object]
 @cache
 def problem_of(path: Path) -> Problem:
     return load(str(path))
+
+
+def part_of(problem: Problem, first: int, stop: int | None = None) -> Problem:
+    """Phases `first` to `stop` of a problem, counted from 0, as a problem of their own."""
+    phases = tuple(replace(phase, index=k) for k, phase in enumerate(problem.phases[first:stop]))
+    start = trace_phases(problem)[first - 1].end if first else problem.start
+    return replace(problem, start=start, phases=phases)
 
 
 def text_of(path: Path = HEPTAGON, phases: int = 1) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import tomllib
 from collections.abc import Callable, Sequence
@@ -31,10 +30,19 @@ from scenes import (
     roll,
     shove,
     tilting,
-    tip,
     tipped,
 )
-from shipped import FOLDER, HEPTAGON, IMPACTS, LANDING, plan_of, problem_of, tipping
+from shipped import (
+    FOLDER,
+    HEPTAGON,
+    IMPACTS,
+    LANDING,
+    SQUARE,
+    part_of,
+    plan_of,
+    problem_of,
+    tipping,
+)
 from timed import (
     fastest_landing,
     instants,
@@ -49,7 +57,6 @@ from wholearm import (
     End,
     Formation,
     InputError,
-    Plan,
     PlanOptions,
     Problem,
     Trajectory,
@@ -60,7 +67,7 @@ from wholearm import (
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import close_contacts
-from wholearm.geometry.tracing import trace_phase, trace_phases
+from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.phase_plan import PhasePlan
@@ -100,23 +107,12 @@ def coarse() -> list[PhasePlan[TimeMotion]]:
     return plan_landing(time_intervals=COARSE)
 
 
-@pytest.fixture(scope="module")
-def gentle() -> list[PhasePlan[TimeMotion]]:
-    return plan_landing(objective="effort", time_intervals=COARSE)
-
-
 @once
 def in_time() -> Trajectory:
     """The heptagon's last slide, for which curves are, over time."""
     options: dict[str, Any] = {"time_intervals": 8, "replay": False}
-    return solve(turning(), transcription="time", **options).trajectory
-
-
-@cache
-def turning() -> Problem:
-    whole = problem_of(HEPTAGON)
-    phase = replace(whole.phases[2], index=0)
-    return replace(whole, start=trace_phases(whole)[1].end, phases=(phase,))
+    problem = part_of(problem_of(HEPTAGON), 2, 3)
+    return solve(problem, transcription="time", **options).trajectory
 
 
 THROWN: dict[str, Any] = {"time_intervals": 8, "mode_search": False, "replay": False}
@@ -146,9 +142,9 @@ def test_least_times_agree_with_those_along_the_curve(
     plan, expected = in_time(), trajectory.meta["phase_durations"][2]
     (motion,) = plan.motions
     assert isinstance(motion, TimeMotion) and plan.meta["transcription"] == "time"
-    report = verify(turning(), plan)
-    assert report.ok, report.to_text()
-    assert np.nanmin(plan.c_n) > turning().epsilon - SLACK
+    problem = part_of(problem_of(HEPTAGON), 2, 3)
+    assert verify(problem, plan).ok
+    assert np.nanmin(plan.c_n) > problem.epsilon - SLACK
     assert np.abs(plan.tau).max() < 2.0 + SLACK
     # Two discretisations of one problem: torques are linear over a 16th of the phase here, or half
     # of that where they switch, so that it takes longer.
@@ -178,18 +174,12 @@ def test_schemes_and_degrees_agree(
 
 def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     """The phase in which the box tips over a vertex."""
-    phase = replace(box().phases[1], index=0)
-    problem = replace(box(), start=tip().start, phases=(phase,))
-    options: dict[str, Any] = {
-        "time_intervals": 16,
-        "mode_search": False,
-        "replay": False,
-        "accuracy": 1e-2,
-    }
-    within = solve(problem, transcription="time", **options)
+    problem = part_of(box(), 1, 2)
+    options: dict[str, Any] = {"time_intervals": 16, "mode_search": False, "accuracy": 1e-2}
+    within = solve(problem, transcription="time", replay=False, **options)
     # Torques that are linear in each interval cost less than the accuracy asked for.
     assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
-    rolls = phase.formation.rolling
+    rolls = problem.phases[0].formation.rolling
     (motion,) = within.trajectory.motions
     assert isinstance(motion, TimeMotion) and len(rolls) == 1
     for stage in motion.stages:
@@ -209,11 +199,7 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
     """Its three features follow in one motion, and an impact that leaves the tip."""
     monkeypatch.setattr("wholearm.planning.plan._find_saving", lambda *_: np.nan)
     whole = build_problem(tomllib.loads(LYING))
-    z = whole.start
-    for phase in whole.phases[:3]:
-        z = trace_phase(phase, z, whole.phases).end
-    phases = tuple(replace(own, index=own.index - 3) for own in whole.phases[3:])
-    passing = replace(whole, start=z, phases=phases)
+    passing = part_of(whole, 3)
     options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
     along = solve(passing, **options)
     within = solve(passing, transcription="time", time_intervals=4, **options)
@@ -226,9 +212,7 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
 
 def test_contacts_that_reverse_at_one_place_do_not_stop_the_motion() -> None:
     """On the square both fingers reverse halfway, by symmetry."""
-    square = problem_of(FOLDER / "square.toml")
-    middle = replace(square.phases[1], index=0)
-    halfway = replace(square, start=trace_phases(square)[0].end, phases=(middle,))
+    halfway = part_of(problem_of(SQUARE), 1, 2)
     options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
     along, within = solve(halfway, **options), solve(halfway, transcription="time", **options)
     assert within.duration == pytest.approx(along.duration, rel=2e-3)  # errors of both
@@ -251,8 +235,7 @@ def test_what_moves_by_itself_takes_its_time(
     # acceleration is constant, not at all.
     accuracy = 1e-12 if throw is shove else 2e-8
     assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=accuracy)
-    report = verify(problem, plan, uniqueness_margin=ANY)
-    assert report.ok, report.to_text()
+    assert verify(problem, plan, uniqueness_margin=ANY).ok
     motion = plan.motions[1]
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
     y, phi = samples.z[:, 1], samples.z[:, 2]
@@ -303,8 +286,10 @@ def check_friction(stages: Sequence[StageMotion]) -> None:
             assert (rates * signs).min() > -1e-4 * np.abs(rates).max()
 
 
-def test_limits_hold_between_points(stages: list[StageMotion]) -> None:
-    problem = landing()
+def test_limits_hold_between_points_and_some_limit_is_used_all_along(
+    stages: list[StageMotion],
+) -> None:
+    problem, used = landing(), []
     check_friction(stages)
     for stage in stages:
         samples = stage.evaluate(instants(stage, 41))
@@ -312,13 +297,6 @@ def test_limits_hold_between_points(stages: list[StageMotion]) -> None:
         assert (np.abs(samples.tau) < problem.scene.torque_limit + SLACK).all()
         # What is gained or released is right on its limit at one end [m].
         assert stage.formation.evaluate_limits(samples.z).min() > -1e-7
-
-
-def test_some_limit_is_used_all_along(stages: list[StageMotion]) -> None:
-    problem = landing()
-    used = []
-    for stage in stages:
-        samples = stage.evaluate(instants(stage, 12))
         room = np.abs(problem.scene.torque_limit - np.abs(samples.tau)).min(axis=1)
         used.append(np.minimum(room, samples.c_n.min(axis=1) - problem.epsilon))
     # Least time: the torque or the force of one finger is near its limit nearly everywhere.
@@ -358,20 +336,9 @@ def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion
     np.testing.assert_allclose(v, 0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("which", ["time", "effort", "margin"])
-def test_values_are_those_of_the_objective(
-    coarse: list[PhasePlan[TimeMotion]], gentle: list[PhasePlan[TimeMotion]], which: str
-) -> None:
-    if which == "time":
-        assert [plan.value for plan in coarse] == [plan.motion.duration for plan in coarse]
-        return
-    if which == "effort":
-        value = sum(plan.value for plan in gentle)
-        assert value == pytest.approx(statistics(stages_of(gentle)), rel=1e-4)
-        return
-    problem, allowed = raised(), 0.07
-    given = problem, problem.phases, problem.start
-    plans = plan_phases(*given, PlanOptions("margin", time_intervals=COARSE), allowed)
+def test_the_value_of_a_margin_is_the_least_force() -> None:
+    problem, allowed, options = raised(), 0.07, PlanOptions("margin", time_intervals=COARSE)
+    plans = plan_phases(problem, problem.phases, problem.start, options, allowed)
     # With more time it would be larger.
     assert total(plans) == pytest.approx(allowed, rel=1e-8)
     samples = [stage.evaluate(instants(stage, 12)) for stage in stages_of(plans)]
@@ -382,11 +349,15 @@ def test_values_are_those_of_the_objective(
     assert plans[0].value > 5 * problem.epsilon
 
 
-def test_the_effort_of_a_gentle_plan_is_least(
-    coarse: list[PhasePlan[TimeMotion]], gentle: list[PhasePlan[TimeMotion]]
+def test_values_are_times_and_efforts_and_the_effort_of_a_gentle_plan_is_least(
+    coarse: list[PhasePlan[TimeMotion]],
 ) -> None:
+    assert [plan.value for plan in coarse] == [plan.motion.duration for plan in coarse]
+    gentle = plan_landing(objective="effort", time_intervals=COARSE)
     stages = stages_of(gentle)
-    assert statistics(stages) < 0.9 * statistics(stages_of(coarse))
+    effort = statistics(stages)
+    assert sum(plan.value for plan in gentle) == pytest.approx(effort, rel=1e-4)
+    assert effort < 0.9 * statistics(stages_of(coarse))
     assert total(coarse) < sum(stage.duration for stage in stages)
     least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
     assert least > landing().epsilon - SLACK
@@ -405,23 +376,19 @@ def test_plans_are_the_same_every_time() -> None:
             np.testing.assert_allclose(after, before, rtol=0, atol=1e-9 * size)
 
 
-def test_the_equations_of_motion_hold_at_any_instant(stages: list[StageMotion]) -> None:
+def test_equations_of_motion_hold_and_contacts_are_closed_at_any_instant(
+    stages: list[StageMotion],
+) -> None:
     rng = np.random.default_rng(8)
     for stage in stages:
-        samples = stage.evaluate(np.sort(rng.uniform(0, stage.duration, 25)))
-        sigma = np.tile(stage.directions.sigma, (25, 1))
-        residual, size = unbalance(stage.formation, samples, sigma)
+        formation = stage.formation
+        samples = stage.evaluate(np.sort(rng.uniform(0, stage.duration, 40)))
+        sigma = np.tile(stage.directions.sigma, (40, 1))
+        residual, size = unbalance(formation, samples, sigma)
         # Rounding of sums of a few terms.
         assert (np.abs(residual) < 1e-11 * size).all()
-        law = -stage.formation.friction * stage.directions.Xi * samples.c_n
+        law = -formation.friction * stage.directions.Xi * samples.c_n
         np.testing.assert_allclose(samples.c_t, law, rtol=1e-12)
-
-
-def test_contacts_are_closed_and_stay_so_at_any_instant(stages: list[StageMotion]) -> None:
-    rng = np.random.default_rng(9)
-    for stage in stages:
-        formation = stage.formation
-        samples = stage.evaluate(rng.uniform(0, stage.duration, 40))
         assert np.abs(measure_gaps(formation, samples.z)).max() < 1e-14
         kinematics = formation.evaluate(samples.z, samples.z_dot)
         opening = np.einsum("nij,nj->ni", kinematics.A, samples.z_dot)
@@ -465,23 +432,16 @@ PARTS = {"time": (0, 2), "effort": (1, 4)}
 
 @cache
 def problem(objective: str) -> Problem:
-    first, last = PARTS[objective]
-    whole = problem_of(IMPACTS)
-    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[first:last])]
-    phases[-1] = replace(phases[-1], end=End.REST)
-    start = trace_phases(whole)[first - 1].end if first else whole.start
-    return replace(whole, start=start, phases=tuple(phases))
+    part = part_of(problem_of(IMPACTS), *PARTS[objective])
+    *moving, last = part.phases
+    return replace(part, phases=(*moving, replace(last, end=End.REST)))
 
 
 @once
-def solved(objective: str) -> Plan:
+def planned(objective: str) -> Trajectory:
     """Plans on few intervals, whose replay is a test of its own."""
     options: dict[str, Any] = {"time_intervals": 4, "replay": False}
-    return solve(problem(objective), objective, transcription="time", **options)
-
-
-def planned(objective: str) -> Trajectory:
-    return solved(objective).trajectory
+    return solve(problem(objective), objective, transcription="time", **options).trajectory
 
 
 @once
@@ -569,16 +529,14 @@ def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
     within = planned("effort")
     # Torques that are linear in a sixth of a phase cannot be as gentle.
     assert -1e-4 < within.meta["value"] / along("effort").meta["value"] - 1 < 1e-2
-    report = verify(problem("effort"), within)
-    assert report.ok, report.to_text()
+    assert verify(problem("effort"), within).ok
 
 
 def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     """The heptagon's landing and the phase before it."""
-    whole, expected = problem_of(LANDING), plan_of(LANDING).meta["phase_durations"][3:]
-    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[3:])]
-    phases[0] = replace(phases[0], end=End.IMPACT)
-    one = replace(whole, start=trace_phases(whole)[2].end, phases=tuple(phases))
+    part, expected = part_of(landing(), 3), plan_of(LANDING).meta["phase_durations"][3:]
+    first, *others = part.phases
+    one = replace(part, phases=(replace(first, end=End.IMPACT), *others))
     struck = solve(one, time_intervals=4, replay=False)
     (row,) = struck.meta["transitions"]
     assert (row["phase"], row["possible"], row["gained"]) == (1, False, "v4-finger1")
@@ -624,18 +582,15 @@ def slide(*ends: float) -> Problem:
     return whole.with_({"phases": [*phases[:-1], phases[-1] | {"end": "rest"}]})
 
 
-def test_a_slide_that_goes_on_smoothly_is_as_fast_as_in_one_piece() -> None:
-    whole, parts = (solve(slide(*ends), replay=False) for ends in ((0.02,), (0.035, 0.02)))
+def test_a_slide_that_goes_on_smoothly_is_as_fast_as_in_one_piece_and_stops_to_turn_back() -> None:
+    ends = (0.02,), (0.035, 0.02), (0.02, 0.03)
+    whole, parts, back = (solve(slide(*own), replay=False) for own in ends)
     assert parts.value == pytest.approx(whole.value, rel=1e-4)
     end, start = ends_of(parts.trajectory, 0)
     np.testing.assert_allclose(start.z_dot, end.z_dot, rtol=0, atol=1e-12)
     assert np.abs(end.z_dot).max() > 0.01
     assert parts.transitions == ()
-
-
-def test_a_slide_that_turns_back_smoothly_stops_there() -> None:
-    there, back = (solve(slide(*ends), replay=False) for ends in ((0.02,), (0.02, 0.03)))
-    assert back.phases[0].value == pytest.approx(there.value, rel=1e-6)
+    assert back.phases[0].value == pytest.approx(whole.value, rel=1e-6)
     end, start = ends_of(back.trajectory, 0)
     assert max(np.abs(end.z_dot).max(), np.abs(start.z_dot).max()) < 1e-9
 
@@ -686,8 +641,7 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
     plan = solve(problem, time_intervals=6, replay=False).trajectory
     assert plan.duration < 0.95 * bound.duration
-    report = verify(problem, plan)
-    assert report.ok, report.to_text()
+    assert verify(problem, plan).ok
 
 
 def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
@@ -732,9 +686,8 @@ LANDS = 0.016
 
 def pin(problem: Problem, index: int, *pins: tuple[str, float]) -> Problem:
     phases = list(problem.phases)
-    until = dataclasses.replace(phases[index].until, pins=pins)
-    phases[index] = dataclasses.replace(phases[index], until=until)
-    return dataclasses.replace(problem, phases=tuple(phases))
+    phases[index] = replace(phases[index], until=replace(phases[index].until, pins=pins))
+    return replace(problem, phases=tuple(phases))
 
 
 def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
@@ -749,9 +702,8 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
     size, speed = problem.scene.scales.length, problem.scene.scales.speed
     assert end.z[0, 0] == pytest.approx(0.0195, abs=1e-7 * size)
     assert np.abs(end.z_dot[0, :2]).max() < 1e-6 * speed
-    formation = make_formation(
-        problem.scene, " ".join([*problem.phases[5].formation.names, "v2-palm"])
-    )
+    names = " ".join([*problem.phases[5].formation.names, "v2-palm"])
+    formation = make_formation(problem.scene, names)
     assert np.abs(measure_gaps(formation, end.z)).max() < 1e-6 * size
 
 
@@ -790,9 +742,7 @@ def test_a_vertex_in_a_corner_may_go_back_first() -> None:
     z = close_contacts(phase.formation, near, np.zeros(0), ((2, 0.0),))
     assert z is not None
     own = replace(problem, start=z, phases=(replace(phase, index=0),))
-    plan = solve(own, time_intervals=6, replay=False).trajectory
-    report = verify(own, plan)
-    assert report.ok, report.to_text()
+    assert verify(own, solve(own, time_intervals=6, replay=False)).ok
 
 
 def test_the_estimated_error_is_about_that_of_a_finer_plan(
@@ -803,11 +753,6 @@ def test_the_estimated_error_is_about_that_of_a_finer_plan(
     error = fine["phase_errors"][4]
     assert error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
     assert lost == pytest.approx(coarse[0].error - error, rel=0.6)
-
-
-def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
-    """The same stages on the formations of another scene."""
-    return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
 
 
 def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
@@ -821,7 +766,8 @@ def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
     assert solution.success
 
     def value(other: Problem) -> float:
-        stages = replace_scene(solution.stages, in_own_units(other))
+        formations = [phase.formation for phase in in_own_units(other).phases]
+        stages = [replace(one, formation=formations[one.phase]) for one in solution.stages]
         nlp = TimeSearch.of(other, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
         g = nlp.solver.function.get_function("nlp_g")(x, [])
@@ -841,17 +787,13 @@ def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
         assert value(problem) - value(other) == saved
 
 
-def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
-    """Slopes, and rows of a polygon about zero with their slack, some of them touching it."""
-    box = np.tile(np.concatenate([np.eye(2), -np.eye(2)]), (count, 1, 1))
-    rows = np.concatenate([rng.normal(size=(count, 3, 2)), box], axis=1)
-    slack = rng.uniform(0.0, 2.0, rows.shape[:2]) * (rng.uniform(size=rows.shape[:2]) > 0.2)
-    return rng.normal(size=(count, 2)), rows, slack
-
-
 @pytest.mark.parametrize("square", [0.0, 0.4])
 def test_the_least_over_a_polygon_is_that_of_a_solver(square: float) -> None:
-    slopes, rows, slack = draw(np.random.default_rng(1), 30)
+    """Over polygons about zero, some of whose sides touch it."""
+    rng, sides = np.random.default_rng(1), np.tile([*np.eye(2), *-np.eye(2)], (30, 1, 1))
+    rows = np.concatenate([rng.normal(size=(30, 3, 2)), sides], axis=1)
+    slack = rng.uniform(0.0, 2.0, rows.shape[:2]) * (rng.uniform(size=rows.shape[:2]) > 0.2)
+    slopes = rng.normal(size=(30, 2))
     least = find_least(slopes, square, rows, slack)
     for k, slope in enumerate(slopes):
         limits = {"type": "ineq", "fun": lambda u, k=k: rows[k] @ u + slack[k]}

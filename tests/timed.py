@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -13,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from once import once
 from plane import accelerate
-from shipped import LANDING, plan_of, problem_of
+from shipped import LANDING, part_of, plan_of, problem_of
 from wholearm import Formation, PlanOptions, Problem
 from wholearm.common.arrays import Array
 from wholearm.geometry.tracing import trace_phases
@@ -32,9 +31,7 @@ def landing() -> Problem:
 @lru_cache(maxsize=1)
 def flip() -> Problem:
     """Phase 4 of the slide and the flip alone, in which nothing reverses."""
-    problem = landing()
-    phase = replace(problem.phases[3], index=0)
-    return replace(problem, start=trace_phases(problem)[2].end, phases=(phase,))
+    return part_of(landing(), 3, 4)
 
 
 @once
