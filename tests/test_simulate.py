@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,16 +29,15 @@ from planned import (
 from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
 from rows import each
-from scenes import constant, hexagon, measure_fingers, shorten, slid
-from shipped import HEPTAGON, IMPACTS, plan_of, problem_of, verified
-from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
+from scenes import constant, hexagon, measure_fingers, slid
+from shipped import HEPTAGON, IMPACTS, part_of, plan_of, problem_of, verified
+from wholearm import Formation, Phase, Problem, TorqueProfile, Until, simulate, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
-from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
@@ -55,9 +51,7 @@ def pick(index: int) -> tuple[Problem, CosineMotion]:
     problem, trajectory = plan()
     motion = trajectory.motions[index]
     assert isinstance(motion, CosineMotion)
-    old = problem.phases[index]
-    phase = Phase(0, old.formation, old.until)
-    return dataclasses.replace(problem, start=motion.curve.start, phases=(phase,)), motion
+    return part_of(problem, index, index + 1), motion
 
 
 def with_friction(problem: Problem, *friction: float) -> Problem:
@@ -165,18 +159,6 @@ def test_error_follows_tolerance() -> None:
     assert errors[-1] < 1e-10
 
 
-@pytest.mark.parametrize("index", [1, 3])
-def test_agrees_with_the_baseline(index: int) -> None:
-    problem, motion = pick(index)
-    torque = motion.fit(1, 24)
-    segment = motion.curve.segments[0]
-    stop = 0.8 * motion.duration
-    state, directions = np.append(problem.start, np.zeros(5)), Directions(segment.Xi, segment.sigma)
-    run = integrate_phase(problem, 0, torque, state, directions, (0.0, stop))
-    found = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
-    assert np.allclose(found, run.state, atol=1e-9, rtol=0)
-
-
 def test_sticks_without_torques() -> None:
     problem, _ = plan()
     simulation = simulate(problem, constant((0.0, 0.0)), times=[0.1])
@@ -266,7 +248,6 @@ def test_contact_is_lost_when_the_squeeze_fades() -> None:
 
 def test_overshoot_arrives_at_a_speed() -> None:
     problem, trajectory = plan()
-
     simulation = simulate(problem, change(trajectory.torque, brake_less))
     event = simulation.find(EventKind.ARRIVAL)[0]
     last = int(np.flatnonzero(simulation.phase == 0)[-1])
@@ -301,7 +282,7 @@ def test_another_limit_ends_the_motion() -> None:
 @pytest.mark.parametrize("solid", [True, False])
 def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
     """The hexagon's plan replayed by a hand with a longer left finger."""
-    problem = shorten(hexagon(solid=solid))
+    problem = part_of(hexagon(solid=solid), 0, 3)
     simulation = simulate(problem, slid().trajectory.torque)
     gaps = measure_fingers(problem.scene, simulation.z)
     if not solid:
@@ -395,31 +376,14 @@ def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
     assert found == pytest.approx(root, abs=1e-12)
 
 
-@pytest.fixture(scope="module")
-def problem() -> Problem:
-    return problem_of(IMPACTS)
-
-
-@pytest.fixture(scope="module")
-def planned() -> Trajectory:
-    return plan_of(IMPACTS)
-
-
-@pytest.fixture(scope="module")
-def replayed(problem: Problem, planned: Trajectory) -> Simulation:
-    return simulate(problem, planned.torque, times=planned.t)
-
-
 @lru_cache(maxsize=4)
 def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
     """The heptagon with low friction runs into its second formation at a speed along the curve.
 
     The torques go on for a distance `beyond` the impact [m], and then step.
     """
-    table: dict[str, Any] = copy.deepcopy(tomllib.loads(HEPTAGON.read_text(encoding="utf-8")))
-    table["phases"] = table["phases"][:2]
-    table["phases"][0]["end"] = "impact"
-    problem = build_problem(table)
+    problem = problem_of(HEPTAGON).with_({"phases[1].end": "impact"})
+    problem = dataclasses.replace(problem, phases=problem.phases[:2])
     curve = trace_phases(problem)[0]
     # Beyond, a motion that slows; otherwise as slow a start as the speed allows.
     duration = (1.2 if beyond else 2.0) * curve.length / max(speed, 0.1)
@@ -434,15 +398,9 @@ def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
     return problem, TorqueProfile.chain([torque, after]) if beyond else torque
 
 
-def joints(simulation: Simulation, index: int) -> tuple[int, int]:
-    """Rows just before and after the end of a phase."""
-    last = int(np.flatnonzero(simulation.phase == index)[-1])
-    return last, last + 1
-
-
-def test_replays_the_plan_through_its_impacts(
-    problem: Problem, planned: Trajectory, replayed: Simulation
-) -> None:
+def test_replays_the_plan_through_its_impacts() -> None:
+    planned = plan_of(IMPACTS)
+    replayed = simulate(problem_of(IMPACTS), planned.torque, times=planned.t)
     assert replayed.outcome.kind is OutcomeKind.GOAL_REACHED
     impacts = replayed.find(EventKind.IMPACT)
     assert [event.phase for event in impacts] == [0, 1]
@@ -483,8 +441,8 @@ def test_next_to_no_speed_is_a_stop() -> None:
     simulation = simulate(problem, torque)
     assert not simulation.find(EventKind.IMPACT)
     assert simulation.phase[-1] == 1 and simulation.find(EventKind.ARRIVAL)
-    last, first = joints(simulation, 0)
-    assert simulation.z_dot[last].any() and not simulation.z_dot[first].any()
+    last = int(np.flatnonzero(simulation.phase == 0)[-1])
+    assert simulation.z_dot[last].any() and not simulation.z_dot[last + 1].any()
 
 
 def test_a_step_of_the_torques_just_before_a_planned_stop_is_not_its_end() -> None:
@@ -503,8 +461,9 @@ def test_a_step_of_the_torques_just_before_a_planned_stop_is_not_its_end() -> No
 
 
 @pytest.mark.parametrize("scale", [1.002, 1.01])
-def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale: float) -> None:
+def test_an_impact_that_comes_early(scale: float) -> None:
     """With torques that are a little off at the end of the first phase."""
+    problem, planned = problem_of(IMPACTS), plan_of(IMPACTS)
     ends = planned.phase_starts[1]
 
     def edit(starts: Array, c: Array) -> Array:
@@ -514,7 +473,8 @@ def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale
     simulation = simulate(problem, change(planned.torque, edit))
     first = simulation.find(EventKind.IMPACT)[0]
     assert 2e-6 < ends - first.time < 5e-3
-    last, after = joints(simulation, 0)
+    last = int(np.flatnonzero(simulation.phase == 0)[-1])
+    after = last + 1
     before, formation = (p.formation for p in problem.phases[:2])
     impact = compute_impact(before, formation, simulation.z[after], simulation.z_dot[last])
     np.testing.assert_allclose(simulation.z_dot[after], impact.v, rtol=0, atol=1e-9)
@@ -522,11 +482,10 @@ def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale
 
 
 @pytest.mark.parametrize("scale", [1 - 4e-6, 1 + 2e-6, 1 + 4e-6])
-def test_a_reversal_next_to_its_torque_step(
-    problem: Problem, planned: Trajectory, scale: float
-) -> None:
+def test_a_reversal_next_to_its_torque_step(scale: float) -> None:
     """Torques that are a little off move it before or behind the step; no contact parts."""
-    simulation = simulate(problem, change(planned.torque, lambda _, c: scale * c))
+    problem, torque = problem_of(IMPACTS), plan_of(IMPACTS).torque
+    simulation = simulate(problem, change(torque, lambda _, c: scale * c))
     assert simulation.outcome.kind is OutcomeKind.GOAL_REACHED, simulation.outcome.text
     loss = np.nanmin(simulation.c_n) - problem.epsilon
     assert loss > -1e-3 * problem.scene.scales.force
@@ -541,23 +500,24 @@ def test_a_reversal_next_to_its_torque_step(
     ],
 )
 def test_other_formations_that_an_impact_cannot_reach(
-    problem: Problem, planned: Trajectory, names: str, kind: OutcomeKind, text: str
+    names: str, kind: OutcomeKind, text: str
 ) -> None:
+    problem = problem_of(IMPACTS)
     contacts = tuple(parse_contact(name, problem.scene) for name in names.split())
     following = Phase(1, Formation(problem.scene, contacts), problem.phases[1].until)
     passing = dataclasses.replace(problem, phases=(problem.phases[0], following))
-    simulation = simulate(passing, planned.torque)
+    simulation = simulate(passing, plan_of(IMPACTS).torque)
     assert simulation.outcome.kind is kind
     (event,) = simulation.find(EventKind.IMPACT)
     assert simulation.outcome.text.startswith(text)
     assert simulation.outcome.text.endswith(f" in the impact at t = {event.time:.5g} s, phase 1")
 
 
-def test_verify_reports_the_impacts(problem: Problem, planned: Trajectory) -> None:
+def test_verify_reports_the_impacts() -> None:
     report = verified(IMPACTS)
     assert report.ok and report.failures == ()
     assert [phase.end for phase in report.phases] == [*4 * ["impact"], "rest"]
-    rows = planned.meta["transitions"]
+    rows = plan_of(IMPACTS).meta["transitions"]
     for phase, row in zip(report.phases[:2], rows[:2], strict=True):
         assert phase.impact is not None and phase.impact.contact == row["least_impulse_contact"]
         assert phase.impact.impulse == pytest.approx(row["least_impulse"] * row["speed"], rel=1e-6)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from pushing import Push, Roll, pushed, rocking
 from scenes import POINTS, box, constant, falling, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
 from wholearm import End, Friction, Phase, Problem, TorqueProfile, Until, simulate, verify
-from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.tracing import trace_phases
@@ -89,7 +87,7 @@ def test_a_falling_box_keeps_its_vertex_until_its_cone_is_left(mu: float, sign: 
     """
     problem = falling(mu, 0.2)
     rolling = problem.phases[0].formation
-    sliding = dataclasses.replace(rolling, rolling=())
+    sliding = replace(rolling, rolling=())
     torque, times = constant((-0.01, 0.01), 1.0), np.linspace(0.0, 0.2, 21)
     rolls, sticks, both = (
         simulate(divide(problem, formations), torque, tolerance=1e-12, times=times)
@@ -129,14 +127,13 @@ def test_a_falling_box_keeps_its_vertex_until_its_cone_is_left(mu: float, sign: 
 
 def test_a_box_cannot_start_to_roll_without_enough_friction() -> None:
     """From rest: c_t / c_n is known, and friction below that lets the vertex slip at once."""
-    about = falling(1.0, 0.2)
-    start = simulate(about, constant((-0.01, 0.01), 0.01))
+    torque = constant((-0.01, 0.01), 0.01)
+    start = simulate(falling(1.0, 0.2), torque)
     row = int(np.flatnonzero(~np.isnan(start.c_n[:, 0]))[0])
     needed = float(start.c_t[row, 0] / start.c_n[row, 0])
     assert 0.1 < needed < 0.4
-    enough = simulate(falling(1.01 * needed, 0.2), constant((-0.01, 0.01), 0.01))
+    enough, short = (simulate(falling(mu * needed, 0.2), torque) for mu in (1.01, 0.99))
     assert enough.outcome.kind is OutcomeKind.GOAL_MISSED and enough.find(EventKind.START)
-    short = simulate(falling(0.99 * needed, 0.2), constant((-0.01, 0.01), 0.01))
     assert short.outcome.kind is OutcomeKind.SLIPS and not short.find(EventKind.START)
     assert "exceeds mu c_n" in short.outcome.text and short.events[-1].time == 0.0
 
@@ -146,8 +143,8 @@ def test_a_rising_push_slips_a_box_when_statics_say_so() -> None:
     mu, rate = 0.3, 0.2
     problem = pushed(mu)
     (phase,) = problem.phases
-    phase = dataclasses.replace(phase, formation=roll(phase.formation, "v0-palm"))
-    problem, scene, z = replace_phases(problem, phase), problem.scene, problem.start
+    phase = replace(phase, formation=roll(phase.formation, "v0-palm"))
+    problem, scene, z = replace(problem, phases=(phase,)), problem.scene, problem.start
     corner = place_corners(scene, z)[2]
     run = np.sqrt(np.sum((corner - scene.fingers[0].base) ** 2) - scene.fingers[0].radius ** 2)
     n = np.array([-np.sin(z[3]), np.cos(z[3])])
@@ -175,10 +172,10 @@ def test_a_sliding_vertex_is_stopped_where_the_next_phase_lets_it_roll() -> None
     """What the impact takes is the difference of both kinetic energies; the cone then decides."""
     problem = falling(0.1, 0.2)
     scene, (last,) = problem.scene, problem.phases
-    slides = dataclasses.replace(last.formation, rolling=())
+    slides = replace(last.formation, rolling=())
     until = Until(coordinate="phi", value=float(problem.start[2]) - 0.4)
-    phases = Phase(0, slides, until, End.SMOOTH), dataclasses.replace(last, index=1)
-    two = dataclasses.replace(problem, phases=phases)
+    phases = Phase(0, slides, until, End.SMOOTH), replace(last, index=1)
+    two = replace(problem, phases=phases)
     simulation = simulate(two, constant((-0.01, 0.01), 1.0), tolerance=1e-11)
     before = int(np.flatnonzero(simulation.phase == 0)[-1])
     z, v = simulation.z[before], simulation.z_dot[before]
@@ -210,12 +207,12 @@ def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
     """Piecewise cubics: J theta'' = tau - D sgn(theta'), and rest where |tau| <= D."""
     problem = pushed(contacts="v0-palm v1-palm")
     scene = problem.scene
-    swings = dataclasses.replace(scene.fingers[0], viscous=0.0)
-    scene = dataclasses.replace(scene, fingers=(swings, scene.fingers[1]))
+    swings = replace(scene.fingers[0], viscous=0.0)
+    scene = replace(scene, fingers=(swings, scene.fingers[1]))
     (phase,) = problem.phases
     away = problem.start - 0.6 * np.eye(5)[3]
-    phase = dataclasses.replace(phase, formation=make_formation(scene, "v0-palm v1-palm"))
-    problem = dataclasses.replace(problem, scene=scene, start=away, phases=(phase,))
+    phase = replace(phase, formation=make_formation(scene, "v0-palm v1-palm"))
+    problem = replace(problem, scene=scene, start=away, phases=(phase,))
     D, J = swings.dry, swings.inertia
     tau = np.column_stack([[0.0, 2 * D, -2 * D, -2 * D], np.full(4, 1e-3)])
     torque = TorqueProfile.join_rows(np.array([0.0, 0.1, 0.3, 0.4]), tau)
@@ -339,8 +336,8 @@ def divide(problem: Problem, formations: Sequence[Formation]) -> Problem:
     """The problem's last phase in several, of which all but the last have no end of their own."""
     last = problem.phases[-1]
     first = [Phase(k, one, Until(), End.SMOOTH) for k, one in enumerate(formations[:-1])]
-    final = dataclasses.replace(last, index=len(first), formation=formations[-1])
-    return dataclasses.replace(problem, phases=(*first, final))
+    final = replace(last, index=len(first), formation=formations[-1])
+    return replace(problem, phases=(*first, final))
 
 
 @pytest.mark.parametrize("share, late", [(0.3, -3e-10), (-0.8, 3e-10)])
@@ -353,7 +350,7 @@ def test_phases_end_where_a_vertex_comes_to_rest_and_slips_by_plan(
     start = trajectory.motions[1].evaluate(np.array([0.1])).z[0]
     plan, sliding = Roll(last.formation, start, share), last.formation
     rolling = roll(sliding, "v1-palm")
-    problem = divide(dataclasses.replace(problem, start=start), [sliding, rolling, sliding])
+    problem = divide(replace(problem, start=start), [sliding, rolling, sliding])
     exact = plan.fit()
     inner = np.where((exact.breaks > 0) & (exact.breaks < 0.15), late, 0.0)
     torque = TorqueProfile(exact.breaks + inner, exact.coefficients)
@@ -378,7 +375,7 @@ def test_what_sticks_as_it_slips_again_and_rests_ends_one_phase_each() -> None:
     """Between two slips the box sticks; what is stuck from the start has not come to rest."""
     problem = falling(0.36, 0.2)
     rolling = problem.phases[0].formation
-    sliding = dataclasses.replace(rolling, rolling=())
+    sliding = replace(rolling, rolling=())
     torque = constant((-0.01, 0.01), 1.0)
     alone = simulate(divide(problem, [sliding]), torque, tolerance=1e-12)
     changes = [e for e in alone.events if e.contact == "v1-palm"]
@@ -391,18 +388,12 @@ def test_what_sticks_as_it_slips_again_and_rests_ends_one_phase_each() -> None:
 def draw(rng: np.random.Generator) -> tuple[Problem, TorqueProfile] | None:
     """An object over one vertex on the palm, and squeezing torques; None if a tip touches it."""
     scene = make_scene(convex_polygon(rng, int(rng.integers(3, 8)), 0.045), base=0.1)
-    links = [
-        dataclasses.replace(
-            link, dry=float(10 ** rng.uniform(-4, -1.5)), inertia=float(10 ** rng.uniform(-4, -2))
-        )
+    right, left = (
+        replace(link, dry=10 ** rng.uniform(-4, -1.5), inertia=10 ** rng.uniform(-4, -2))
         for link in scene.fingers
-    ]
-    scene = dataclasses.replace(
-        scene,
-        friction=Friction(*rng.uniform(0.02, 0.5, 3)),
-        fingers=(links[0], links[1]),
-        fingers_collide=False,
     )
+    friction = Friction(*rng.uniform(0.02, 0.5, 3))
+    scene = replace(scene, friction=friction, fingers=(right, left), fingers_collide=False)
     phi = rng.uniform(-np.pi, np.pi)
     low = (scene.polygon.vertices @ [np.sin(phi), np.cos(phi)]).min()
     q = np.array([rng.uniform(-0.03, 0.03), -low, phi])
@@ -444,12 +435,6 @@ def landing_of(duration: float = 0.2) -> LandingMotion:
     return motion
 
 
-def brake_less(starts: Array, c: Array) -> Array:
-    """Near the end of the landing."""
-    c[starts > 0.66] *= 0.97
-    return c
-
-
 @once
 def plan_passing(x: float) -> tuple[Problem, TorqueProfile, float]:
     """The hexagon slides from `x` until vertex 4 goes round the tip of finger 2, and when."""
@@ -464,14 +449,10 @@ def plan_passing(x: float) -> tuple[Problem, TorqueProfile, float]:
     return problem, trajectory.torque, float(trajectory.t[trajectory.phase == 1][0])
 
 
-def replace_phases(problem: Problem, *phases: Phase) -> Problem:
-    return dataclasses.replace(problem, phases=phases)
-
-
 def test_releases_and_lands_as_planned() -> None:
     problem, trajectory = plan_landing()
     simulation = simulate(problem, trajectory.torque, times=trajectory.t)
-    assert simulation.outcome.kind is OutcomeKind.GOAL_REACHED
+    assert simulation.outcome.reached
     for index, motion in enumerate(trajectory.motions):
         rows = np.flatnonzero(simulation.phase == index)
         end = motion.evaluate(np.array([motion.duration]))
@@ -517,7 +498,7 @@ def test_a_coordinate_may_be_passed_at_speed(off: float) -> None:
     first, last = problem.phases
     value = float(landing_of().start[2]) + off
     until = Until(coordinate="phi", value=value)
-    passing = replace_phases(problem, dataclasses.replace(first, until=until), last)
+    passing = replace(problem, phases=(replace(first, until=until), last))
     simulation = simulate(passing, trajectory.torque)
     assert simulation.outcome.reached
     arrival = simulation.find(EventKind.ARRIVAL)[0]
@@ -534,10 +515,11 @@ def test_a_contact_gained_at_speed_and_kept() -> None:
     gained = last.until.contact
     assert gained is not None
     flat = Formation(problem.scene, (*last.formation.contacts, gained))
-    going = dataclasses.replace(last, end=End.SMOOTH)
+    going = replace(last, end=End.SMOOTH)
     after = Phase(2, flat, Until(coordinate="x", value=1.0))
-    passing = replace_phases(problem, first, going, after)
-    torque = change(trajectory.torque, brake_less)
+    passing = replace(problem, phases=(first, going, after))
+    # The landing brakes less near its end.
+    torque = change(trajectory.torque, lambda t, c: c * np.where(t > 0.66, 0.97, 1)[:, None, None])
     simulation = simulate(passing, torque)
     arrival = next(e for e in simulation.events if e.kind is EventKind.ARRIVAL)
     before = int(np.flatnonzero(simulation.phase == 1)[-1])
@@ -575,7 +557,7 @@ def test_start_with_two_freedoms() -> None:
     phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
     z = landing_of().evaluate(np.array([0.1])).z[0]
     rng = np.random.default_rng(3)
-    moving = replace_phases(dataclasses.replace(problem, start=z), phase)
+    moving = replace(problem, start=z, phases=(phase,))
     rest, seen = find_rest(phase.formation, z), 0
     assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
@@ -606,7 +588,7 @@ def test_start_with_a_contact_that_sticks() -> None:
     problem, _ = plan_landing()
     phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
     z = landing_of().evaluate(np.array([0.1])).z[0]
-    still = replace_phases(dataclasses.replace(problem, start=z), phase)
+    still = replace(problem, start=z, phases=(phase,))
     tau = np.array([0.4, -0.4])
     simulation = simulate(still, constant(tau, 0.01))
     assert simulation.events[0].kind is EventKind.START
@@ -647,13 +629,10 @@ def test_of_breaks_near_each_other_a_phase_ends_at_the_nearest(early: float) -> 
 
 def slide_to_the_tip(until: str) -> Problem:
     """The hexagon slides until v5 is at the pointed tip of a short finger 2, and back."""
-    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
-    for key, length in ("1", 0.18), ("2", 0.057):
-        table["fingers"][key] |= {"length": length, "radius": 0.0}
-    table["start"]["x"] = -0.03
     contacts = ["v0-palm", "v1-palm", "v3-finger1", "v5-finger2"]
-    ends: list[object] = [until, {"x": -0.025}]
-    return build_problem(table | {"phases": [{"contacts": contacts, "until": u} for u in ends]})
+    phases = [{"contacts": contacts, "until": end} for end in (until, {"x": -0.025})]
+    changes = {"length1": 0.18, "length2": 0.057, "radius": 0.0, "x": -0.03, "phases": phases}
+    return problem_of(HEXAGON).with_(changes)
 
 
 @pytest.mark.parametrize("until", ["e4-tip2", "e5-tip2"])

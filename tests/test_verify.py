@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import re
@@ -17,7 +16,7 @@ from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
 from rows import each
 from scenes import PALM, box, measure_fingers, scale, slid, tipped
-from shipped import BOX, HEPTAGON, plan_of, problem_of, verified
+from shipped import BOX, HEPTAGON, part_of, plan_of, problem_of, verified
 from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
 from wholearm.benchmark.stress import check_plan as check_again
 from wholearm.common.arrays import Array
@@ -92,11 +91,9 @@ def test_virtual_power() -> None:
 
 
 def phases_of(problem: Problem, trajectory: Trajectory) -> list[tuple[Formation, Samples]]:
-    found = []
-    for phase, motion in zip(problem.phases, trajectory.motions, strict=True):
-        t = np.linspace(0.0, motion.duration, 301)[1:-1]
-        found.append((phase.formation, motion.evaluate(t)))
-    return found
+    places = np.linspace(0.0, 1.0, 301)[1:-1]
+    pairs = zip(problem.phases, trajectory.motions, strict=True)
+    return [(phase.formation, own.evaluate(own.duration * places)) for phase, own in pairs]
 
 
 @pytest.mark.parametrize("case", [plan, plan_landing, lambda: (box(), tipped())])
@@ -239,25 +236,33 @@ def test_least_forces_are_those_of_inverse_dynamics() -> None:
 
 
 def test_a_thin_margin_fails_a_plan_but_not_torques() -> None:
+    """The verdict and its reason come first in a report."""
     problem, trajectory = plan()
-    strict = dataclasses.replace(problem, epsilon=0.25)
-    report = verify(strict, trajectory)
-    assert report.exit_status == 1 and report.reached
-    (text,) = report.failures
-    thin = report.phases[0].contacts[3]
+    strict, good = replace(problem, epsilon=0.25), replayed()
+    thin = verify(strict, trajectory)
+    assert thin.exit_status == 1 and thin.reached
+    (text,) = thin.failures
+    margin = thin.phases[0].contacts[3]
     assert text == (
-        f"c_n of v5-finger2 falls to {thin.least:.5g} N, below epsilon = 0.25 N, "
-        f"at t = {thin.time:.5g} s, phase 1"
+        f"c_n of v5-finger2 falls to {margin.least:.5g} N, below epsilon = 0.25 N, "
+        f"at t = {margin.time:.5g} s, phase 1"
     )
+    for report, verdict in (good, "ok"), (thin, "FAILED"):
+        lines = report.to_text().splitlines()
+        assert lines[0] == f"{problem.name}: {verdict}: {report.reason}"
+        assert report.to_dict()["reason"] == report.reason
+    assert good.reason == good.outcome and thin.reason == text != thin.outcome
+    assert f"end of the replay: {thin.outcome}" in thin.to_text()
+    assert good.to_text().count(good.outcome) == thin.to_text().count(thin.outcome) == 1
     relaxed = verify(strict, trajectory.torque)
-    assert relaxed.ok and relaxed.warnings == report.failures
+    assert relaxed.ok and relaxed.warnings == thin.failures
     assert relaxed.phases[0].deviation is None
 
 
 def test_an_end_at_rest_reached_at_speed_fails() -> None:
     """Constant torques that drive the first phase through its end."""
     problem, _ = plan()
-    one = dataclasses.replace(problem, phases=problem.phases[:1])
+    one = replace(problem, phases=problem.phases[:1])
     push = TorqueProfile(np.array([0.0, 5.0]), np.array([[[0.3], [0.0]]]))
     simulation = simulate(one, push)
     speed = float(np.hypot(*simulation.z_dot[-1, :2]))
@@ -278,33 +283,20 @@ def test_an_end_at_rest_reached_at_speed_fails() -> None:
     assert not verify(one, push, rest_speed=0.99 * speed / scale).ok
 
 
-def test_the_verdict_and_its_reason_come_first() -> None:
-    problem, trajectory = plan()
-    good, strict = replayed(), dataclasses.replace(problem, epsilon=0.25)
-    thin = verify(strict, trajectory)
-    for report, verdict in (good, "ok"), (thin, "FAILED"):
-        lines = report.to_text().splitlines()
-        assert lines[0] == f"{problem.name}: {verdict}: {report.reason}"
-        assert report.to_dict()["reason"] == report.reason
-    assert good.reason == good.outcome and thin.reason == thin.failures[0] != thin.outcome
-    assert f"end of the replay: {thin.outcome}" in thin.to_text()
-    assert good.to_text().count(good.outcome) == thin.to_text().count(thin.outcome) == 1
-
-
 def test_a_replay_far_from_its_plan_fails() -> None:
     """The plan of another motion: the torques carry the object, but elsewhere."""
     problem, trajectory = plan()
     elsewhere = trajectory.q.copy()
     shift = np.where(trajectory.phase == 2, 4e-4 * np.sin(trajectory.t), 0.0)
     elsewhere[:, 0] += shift
-    report = verify(problem, dataclasses.replace(trajectory, q=elsewhere))
+    report = verify(problem, replace(trajectory, q=elsewhere))
     (text,) = report.failures
     worst = float(np.abs(shift).max())
     time = float(trajectory.t[np.abs(shift).argmax()])
     length = problem.scene.scales.length
     assert text.startswith(f"phase 3 departs from the plan, by {worst:.2g} m and ")
     assert f" at t = {time:.5g} s; {1e-3 * length:.2g} m and 0.001 rad are allowed" in text
-    assert verify(problem, dataclasses.replace(trajectory, q=elsewhere), departure=0.02).ok
+    assert verify(problem, replace(trajectory, q=elsewhere), departure=0.02).ok
 
 
 @each("key", ["departure", "rest_speed"])
@@ -319,10 +311,10 @@ def test_tolerances_are_positive(key: str, value: float) -> None:
 def test_epsilon_on_the_edge_is_kept() -> None:
     problem, trajectory = plan()
     least = min(c.least for p in replayed().phases for c in p.contacts)
-    touching = dataclasses.replace(problem, epsilon=1.0015 * least)
+    touching = replace(problem, epsilon=1.0015 * least)
     assert verify(touching, trajectory).ok
     # Beyond rounding and the 0.2 % that an open-loop replay may stray.
-    over = dataclasses.replace(problem, epsilon=1.0025 * least)
+    over = replace(problem, epsilon=1.0025 * least)
     assert not verify(over, trajectory).ok
 
 
@@ -366,9 +358,7 @@ def test_torques_for_nothing() -> None:
 
 def test_torques_beyond_their_limit_are_a_warning() -> None:
     problem, trajectory = plan()
-    right, left = (dataclasses.replace(f, torque_limit=1.0) for f in problem.scene.fingers)
-    weak = dataclasses.replace(problem.scene, fingers=(right, left))
-    report = verify(dataclasses.replace(problem, scene=weak), trajectory.torque)
+    report = verify(problem.with_(torque_limit=1.0), trajectory.torque)
     assert report.ok
     assert any("above its limit 1 N m" in text for text in report.warnings)
 
@@ -388,7 +378,7 @@ def test_speeds_beyond_their_limit_are_a_warning() -> None:
 
 def test_another_problem_is_refused() -> None:
     problem, trajectory = plan()
-    shorter = dataclasses.replace(problem, phases=problem.phases[:2])
+    shorter = replace(problem, phases=problem.phases[:2])
     with pytest.raises(InputError, match="v6-finger2"):
         verify(shorter, trajectory)
 
@@ -534,17 +524,11 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     assert (fine["sample_rate"], fine["interpolation"]) == (8000.0, interpolation)
     assert not coarse["replay"]["ok"] and " phase " in coarse["replay"]["reason"]
 
-    def find_errors(figures: dict[str, object]) -> Array:
-        replay = figures["replay"]
-        assert isinstance(replay, dict)
-        first = replay["phases"][0]
+    def find_errors(figures: dict[str, Any]) -> Array:
+        first = figures["replay"]["phases"][0]
         arrival = np.inf if first["arrival"] is None else first["arrival"]
-        return np.array(
-            [
-                abs(arrival - first["planned_arrival"]),
-                abs(first["least_c_n"] - first["planned_least_c_n"]),
-            ]
-        )
+        off = arrival - first["planned_arrival"], first["least_c_n"] - first["planned_least_c_n"]
+        return np.abs(off)
 
     # What is d off at its end arrives sqrt(2 d / a) early: half a period of delay takes 4 ms.
     assert (find_errors(fine) < [0.02, 0.02]).all()
@@ -553,7 +537,7 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     assert unplayed.figures["replay"] is None
 
 
-def test_a_plan_that_holds() -> None:
+def test_a_plan_that_holds_and_torques_that_do_not_carry_the_motion() -> None:
     problem, trajectory = plan()
     check = check_plan(problem, trajectory, Allowance())
     harsh = check_plan(problem, trajectory, Allowance(departure=1e-15))
@@ -562,10 +546,6 @@ def test_a_plan_that_holds() -> None:
     assert isinstance(check.report, Report)
     # Every piece is a step, and few end elsewhere.
     assert check.report.steps < 2 * len(trajectory.torque.coefficients) + 150
-
-
-def test_torques_that_do_not_carry_the_motion_are_found() -> None:
-    problem, trajectory = plan()
     weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
     check = check_plan(problem, weak, Allowance())
     assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
@@ -589,16 +569,10 @@ def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
     assert check.failure == (3, found.text)
 
 
-@pytest.fixture(scope="module")
-def slide(heptagon: Problem) -> Problem:
-    """The heptagon's first two phases."""
-    return replace(heptagon, phases=heptagon.phases[:2])
-
-
-def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> None:
+def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     """The plan is one for a smaller epsilon."""
     short, options = 1e-3, PlanOptions(intervals=10)
-    slide = replace(slide, phases=slide.phases[:1])
+    slide = part_of(problem_of(HEPTAGON), 0, 1)
     easy = replace(slide, epsilon=slide.epsilon - short)
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
     held, figures = replay_plan(replace(planning, problem=slide), lambda _: None)
@@ -607,9 +581,7 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> 
     assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
 
 
-def test_a_plan_that_jams_in_its_replay_is_refused(
-    slide: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plan_that_jams_in_its_replay_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     error = JammingError("v1-palm jams in phase 2 at t = 0.1 s")
     error.phase = 2
 
@@ -618,7 +590,7 @@ def test_a_plan_that_jams_in_its_replay_is_refused(
 
     monkeypatch.setattr(self_check, "check_plan", replay)
     with pytest.raises(ReplayError) as caught:
-        solve(replace(slide, phases=slide.phases[:2]), intervals=10)
+        solve(part_of(problem_of(HEPTAGON), 0, 2), intervals=10)
     text = str(caught.value)
     assert text.startswith("the plan of phase 2 does not hold in its replay: v1-palm jams in phase")
     assert " at t = 0.1 s; " in text and "--no-replay" in text
