@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
@@ -27,8 +26,8 @@ from wholearm import Problem
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve, directions_of
-from wholearm.geometry.tracing import trace_phase, trace_phases
-from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, inverse
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import LAMBDA, ONE, A, inverse
 from wholearm.planning import lower_bound
 from wholearm.planning.blocks import make_sequence
 from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
@@ -214,6 +213,9 @@ def test_two_halves_are_one_whole(objective: str) -> None:
     duration = 6.0 if objective == "margin" else None
     with half.in_place():
         parts = plan_curves((half.curve, half.curve), half.epsilon, options, (1, 2), duration)
+        joined = bound_least_time((half.curve, half.curve), half.epsilon)
+    assert joined is not None
+    assert joined.value == pytest.approx(bound(whole).value, rel=1e-7)
     one = whole.plan(duration, objective=objective, intervals=80)
     values = [part.value for part in parts]
     value = values[0] if objective == "margin" else sum(values)
@@ -263,36 +265,22 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
 # No plan: why, where and by how much.
 
 
-def least_shortfall(problem: Problem, phase: int, s: float, row: int) -> float:
-    """Least shortfall of one limit when all others hold, by a linear program at one place.
+def least_shortfall(problem: Problem, phase: int, row: int) -> float:
+    """Least shortfall of one limit when all others hold, by a linear program at the start.
 
-    At the start b is 0 and a >= 0; elsewhere both are free. Rows are c_n, then tau.
+    There b is 0 and a >= 0. Rows are c_n, then tau.
     """
     curve = trace_phases(problem)[phase]
-    segment: NDArray[np.int64] = np.array(
-        [next(i for i, part in enumerate(curve.segments) if s <= part.stop)]
-    )
-    forces = inverse(
-        curve.formation, *curve.evaluate(np.array([s]))[:3], directions_of(curve, segment)
-    )
-    limit = curve.formation.scene.torque_limit
-    c_n, tau = forces.of_c[0][:, [A, B, LAMBDA]], forces.of_tau[0][:, [A, B, LAMBDA]]
+    point, directions = curve.evaluate(np.zeros(1)), directions_of(curve, np.zeros(1, dtype=int))
+    forces, limit = inverse(curve.formation, *point[:3], directions), problem.scene.torque_limit
+    c_n, tau = forces.of_c[0], forces.of_tau[0]
     rows = np.vstack([c_n, tau, -tau])
-    right = np.concatenate(
-        [
-            problem.epsilon - forces.of_c[0, :, ONE],
-            -limit - forces.of_tau[0, :, ONE],
-            -limit + forces.of_tau[0, :, ONE],
-        ]
-    )
-    soft = np.zeros(8)
+    right = np.concatenate([np.full(len(c_n), problem.epsilon), -limit, -limit]) - rows[:, ONE]
+    soft = np.zeros((8, 1))
     soft[[row] if row < 4 else [row, row + 2]] = 1.0
-    result = linprog(
-        [0, 0, 0, 1],
-        A_ub=-np.column_stack([rows, soft]),
-        b_ub=-right,
-        bounds=[(0 if s == 0 else None, None), (0, 0 if s == 0 else None), (None, None), (0, None)],
-    )
+    table = np.hstack([rows[:, [A, LAMBDA]], soft])
+    bounds = [(0, None), (None, None), (0, None)]
+    result = linprog([0, 0, 1], A_ub=-table, b_ub=-right, bounds=bounds)
     assert result.success
     return float(result.fun)
 
@@ -319,7 +307,7 @@ def test_shortfall_is_that_of_a_linear_program(
     assert found is not None, message
     assert found[2] == limit
     # The planner also weighs time, a little, and rounds to three digits.
-    exact = least_shortfall(problem, int(found[1]) - 1, 0.0, row)
+    exact = least_shortfall(problem, int(found[1]) - 1, row)
     assert exact > 0.01 and float(found[3]) == pytest.approx(exact, rel=0.03)
 
 
@@ -519,14 +507,6 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
     assert plan_path(curves[0], 0.05, options, 1, advised["duration"]).value > 0.05 * (1 - 1e-6)
 
 
-def test_two_bounds_are_one() -> None:
-    half = Toy(constant(1.0, 0.5, 0.2))
-    with half.in_place():
-        joined = bound_least_time((half.curve, half.curve), half.epsilon)
-    assert joined is not None
-    assert joined.value == pytest.approx(bound(Toy(half.law, length=2.0)).value, rel=1e-7)
-
-
 def test_no_motion_has_no_bound() -> None:
     # The squeeze alone, 0.05 N at a lever of 50 m, takes more torque than there is.
     toy = Toy(constant(1.0, 50.0))
@@ -555,7 +535,7 @@ OCTAGON = """
 """A slide on edge 0 until an edge is flush on finger 2, and the flip that follows."""
 
 
-def trace_octagon() -> tuple[list[Curve], float]:
+def trace_octagon() -> tuple[tuple[Curve, ...], float]:
     """The curves of the flip, which is slowest by far where a joint turns back, and epsilon."""
     finger = {"length": 0.2, "radius": 0.015, "inertia": 0.004, "viscous": 0.01, "dry": 0.01}
     finger["torque_limit"] = 5.0
@@ -575,11 +555,7 @@ def trace_octagon() -> tuple[list[Curve], float]:
             "phases": [{"contacts": own.split(), "until": until} for own, until in phases],
         }
     )
-    z, curves = problem.start, []
-    for phase in problem.phases:
-        curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
-        z = curves[-1].end
-    return curves[1:], problem.epsilon
+    return trace_phases(problem)[1:], problem.epsilon
 
 
 def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 from independent import balances
 from once import once
 from rows import each
-from shipped import HEPTAGON, problem_of, solved
+from shipped import HEPTAGON, part_of, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
 from wholearm.planning import dwell
@@ -225,8 +225,7 @@ def test_wrong_keys_are_named(changes: dict[str, object], key: str, allowed: str
 
 @pytest.fixture(scope="module")
 def heptagon() -> Problem:
-    problem = problem_of(HEPTAGON)
-    return replace(problem, phases=problem.phases[:2])
+    return part_of(problem_of(HEPTAGON), 0, 2)
 
 
 @pytest.fixture(scope="module")
@@ -304,28 +303,20 @@ def test_limited_torques_change_into_a_dwell_and_out_of_it(
         np.testing.assert_allclose(torque.at(t), [phase.settling.tau] * 5, rtol=1e-6)
 
 
-def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem, Plan]) -> None:
+def test_breaks_just_before_the_end_of_a_phase_do_not_end_it_and_early_ends_keep_their_torques(
+    slow: tuple[Problem, Plan],
+) -> None:
     problem, plan = slow
     torque, first = plan.trajectory.torque, float(plan.trajectory.phase_starts[1])
     breaks = np.unique([*torque.breaks, *np.linspace(first - 1e-3, first, 41)[:-1]])
     dense = TorqueProfile.fit(breaks, torque.at, torque.coefficients.shape[2] - 1)
-    found = simulate(problem, dense)
-    assert found.outcome.kind is OutcomeKind.GOAL_REACHED
-    came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
-    assert came == pytest.approx(first, abs=REST_WINDOW * problem.scene.scales.time)
-
-
-def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(
-    slow: tuple[Problem, Plan],
-) -> None:
-    problem, plan = slow
     # With less mass the first phase ends a millisecond early, on torques that still brake.
     lighter = problem.with_(mass=(1 - 6e-4) * problem.scene.polygon.mass)
-    torque, first = plan.trajectory.torque, float(plan.trajectory.phase_starts[1])
-    found = simulate(lighter, torque)
-    assert found.outcome.kind is OutcomeKind.GOAL_REACHED
-    came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
-    assert came < first - 2e-4
+    runs = simulate(problem, dense), simulate(lighter, torque)
+    assert all(run.outcome.kind is OutcomeKind.GOAL_REACHED for run in runs)
+    timely, early = (run.find(EventKind.ARRIVAL)[0].time for run in runs)
+    assert timely == pytest.approx(first, abs=REST_WINDOW * problem.scene.scales.time)
+    assert early < first - 2e-4
 
 
 def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
@@ -345,7 +336,7 @@ def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
 
 
 def test_phases_over_time_take_as_long_as_along_their_curves(heptagon: Problem) -> None:
-    problem = replace(heptagon.with_(torque_rate_limit=50.0), phases=heptagon.phases[:1])
+    problem = part_of(heptagon.with_(torque_rate_limit=50.0), 0, 1)
     along = solve(problem, replay=False, intervals=40)
     options: dict[str, Any] = {"mode_search": False, "time_intervals": 6}
     over = solve(problem, replay=False, transcription="time", **options)
@@ -355,10 +346,8 @@ def test_phases_over_time_take_as_long_as_along_their_curves(heptagon: Problem) 
     for t in (0.0, over.duration):
         tau, z = torque.at(np.array([t]))[0], over.at(t).z[0]
         assert balances(problem.phases[0].formation, z, tau)
-        assert (
-            np.abs(over.at(t).z_ddot[0]).max()
-            < 1e-5 * np.abs(over.at(over.duration / 3).z_ddot[0]).max()
-        )
+        ends, middle = (np.abs(over.at(time).z_ddot[0]).max() for time in (t, over.duration / 3))
+        assert ends < 1e-5 * middle
 
 
 @pytest.mark.parametrize(("key", "value"), [("torque_rate_limit1", -1.0), ("actuator_lag", 1e6)])
@@ -376,12 +365,9 @@ def test_keys_of_motors_are_checked_and_kept(heptagon: Problem, key: str, value:
 def test_one_motor_is_at_its_rate_or_its_command_throughout(heptagon: Problem, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rates, lags = 10 ** rng.uniform(1, 4, 2), 10 ** rng.uniform(-4, -1, 2) * [seed > 2, seed > 5]
-    scene = heptagon.with_(
-        torque_rate_limit1=rates[0],
-        torque_rate_limit2=rates[1],
-        actuator_lag1=lags[0],
-        actuator_lag2=lags[1],
-    ).scene
+    limits = {f"torque_rate_limit{k}": rate for k, rate in enumerate(rates, 1)}
+    delays = {f"actuator_lag{k}": lag for k, lag in enumerate(lags, 1)}
+    scene = heptagon.with_(limits | delays).scene
     before, after = rng.uniform(-0.98, 0.98, (2, 2)) * scene.torque_limit
     change = change_torques(scene, before, after)
     t = np.linspace(0.0, change.duration, 4001)
@@ -406,15 +392,9 @@ def test_a_torque_at_its_limit_is_reached_in_a_finite_time(heptagon: Problem) ->
 PERIOD = 0.011
 
 
-@pytest.fixture(scope="module")
-def slide() -> Problem:
-    problem = problem_of(HEPTAGON)
-    return replace(problem, phases=problem.phases[:1])
-
-
 @pytest.mark.parametrize("hold", ["constant", "linear"])
-def test_torques_are_held_from_period_to_period(slide: Problem, hold: str, tmp_path: Path) -> None:
-    problem = slide.with_(control_period=PERIOD, control_hold=hold)
+def test_torques_are_held_from_period_to_period(hold: str, tmp_path: Path) -> None:
+    problem = part_of(problem_of(HEPTAGON), 0, 1).with_(control_period=PERIOD, control_hold=hold)
     plan = solve(problem, accuracy=1e-2, mode_search=False, replay=False)
     assert verify(problem, plan).ok
     torque, spans = plan.trajectory.torque, np.arange(0.0, plan.duration, PERIOD)
@@ -437,7 +417,8 @@ def test_torques_are_held_from_period_to_period(slide: Problem, hold: str, tmp_p
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
 
 
-def test_keys_are_checked(slide: Problem) -> None:
+def test_keys_are_checked() -> None:
+    slide = part_of(problem_of(HEPTAGON), 0, 1)
     with pytest.raises(InputError, match="control_period"):
         slide.with_(control_period=-1.0)
     with pytest.raises(InputError, match="'constant' and 'linear'"):
