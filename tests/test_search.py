@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -80,9 +81,11 @@ def chart() -> Roadmap:
     return Roadmap(problem_of(HEPTAGON), 0.1)
 
 
-def search(goal: Goal) -> RouteSearch:
-    problem = problem_of(HEPTAGON)
-    return RouteSearch(chart(), make_place(problem.scene, problem.start), goal)
+def search(goal: Goal, changed: Problem | None = None) -> RouteSearch:
+    """A search for the heptagon, or for another problem with a roadmap of its own."""
+    problem = changed or problem_of(HEPTAGON)
+    roadmap = Roadmap(changed, 0.1) if changed else chart()
+    return RouteSearch(roadmap, make_place(problem.scene, problem.start), goal)
 
 
 @cache
@@ -144,8 +147,8 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     known = load_roadmap(folder, "one")
     assert known is not None and load_roadmap(folder, "other") is None
     problem = problem_of(HEPTAGON)
-    own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
-    again = next(own.run())
+    place = make_place(problem.scene, problem.start)
+    again = next(RouteSearch(known, place, Goal(flush=6)).run())
     assert again.key == route.key and again.estimate == route.estimate
     (file,) = folder.iterdir()
     written = file.read_bytes()
@@ -158,8 +161,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
 
 def test_what_blocks_is_said() -> None:
     # With next to no torque nothing moves.
-    weak = problem_of(HEPTAGON).with_(torque_limit=0.02)
-    own = RouteSearch(Roadmap(weak, 0.1), make_place(weak.scene, weak.start), Goal(flush=6))
+    own = search(Goal(flush=6), problem_of(HEPTAGON).with_(torque_limit=0.02))
     assert not list(own.run()) and len(own.reached) == 1
     text = describe_block(own, [], "")
     assert text.startswith("nothing leads from x = 45 mm, phi = -1.984 deg to edge 6 on the palm")
@@ -167,12 +169,9 @@ def test_what_blocks_is_said() -> None:
         assert f"until {contact} from x = 45 mm, phi = -1.984 deg: no motion begins" in text
 
 
-def test_a_goal_that_holds_is_no_goal() -> None:
+def test_goals_that_hold_or_are_out_of_reach_are_refused_without_a_search() -> None:
     with pytest.raises(InputError, match="goal: edge 0 on the palm holds already"):
         find_route(read({"flush": 0}))
-
-
-def test_a_goal_out_of_the_hand_s_reach_is_refused_without_a_search() -> None:
     scene, near = problem_of(HEPTAGON).scene, float(problem_of(HEPTAGON).start[2])
     for goal in (Goal(flush=1, x=0.02), Goal(phi=-0.9, x=0.0), Goal(flush=3)):
         require_reach(scene, goal, near)
@@ -181,18 +180,11 @@ def test_a_goal_out_of_the_hand_s_reach_is_refused_without_a_search() -> None:
 
 
 def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
         find_route(read({"flush": 6}), time_limit=1e-9)
-    monkeypatch.setattr("wholearm.search.astar.plan_part", interrupt)
+    monkeypatch.setattr("wholearm.search.astar.plan_part", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
-
-
-def fail(*_: object) -> None:
-    raise InputError("found", "", "cannot be written: No space left on device")
 
 
 def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,7 +199,8 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wholearm.search.find_route.store_roadmap", fail)
+        full = InputError("found", "", "cannot be written: No space left on device")
+        patch.setattr("wholearm.search.find_route.store_roadmap", Mock(side_effect=full))
         assert main(["route", str(path), "--cache", str(found)]) == 0
     said = capsys.readouterr()
     assert tomllib.loads(said.out)["phases"] == [phase]
@@ -244,7 +237,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
 def test_what_is_advised_opens_the_way() -> None:
     """On a rough palm the slide cannot begin; with the friction that is named it can."""
     goal, rough = Goal(flush=0, x=0.03), problem_of(HEPTAGON).with_(friction_palm=1.5)
-    own = RouteSearch(Roadmap(rough, 0.1), make_place(rough.scene, rough.start), goal)
+    own = search(goal, rough)
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
     assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
@@ -259,9 +252,8 @@ def test_what_is_advised_opens_the_way() -> None:
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
-    assert next(
-        RouteSearch(Roadmap(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
-    ).estimate == pytest.approx(float(text.split()[-2]), rel=0.05)
+    route = next(search(goal, eased).run())
+    assert route.estimate == pytest.approx(float(text.split()[-2]), rel=0.05)
     coarse = PlanOptions(intervals=20)
     with advising(lambda wanted: wanted.key == "friction.palm"):
         said = describe_block(own, [], text, lambda at: explain_block(rough, coarse, at))
@@ -273,8 +265,8 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
 ) -> None:
     """With links of 0.18 m the fingers touch halfway through the slide; none closes at x = 0."""
     crossing = read({"flush": 0, "x": -0.01}, HEXAGON).with_(length=0.18)
-    (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
-    own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
+    (goal,), told = crossing.goals, list[str]()
+    own = search(goal, crossing)
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))
     text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
@@ -283,10 +275,8 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     closed = [close_fingers(p.scene, np.zeros(1), p.start[2:3]) for p in (crossing, changed)]
     assert [bool(c.obstacle.any()) for c in closed] == [True, False]
 
-    def end(_: str) -> None:
-        raise OutOfTime
-
-    text, changes = find_hand(own, crossing, PlanOptions(), 0.0, end)
+    late = Mock(side_effect=OutOfTime)
+    text, changes = find_hand(own, crossing, PlanOptions(), 0.0, late)
     assert changes == () and "not reached with 0 other" in text
 
 
@@ -466,11 +456,8 @@ def test_slide_is_listed_as_in_the_problem_file(heptagon: Problem) -> None:
     text = format_route(list_degrees(heptagon, (0.045, FLAT), (-0.0637, FLAT)))
     assert tomllib.loads(text)["phases"] == HEPTAGON_TABLE["phases"][:3]
     assert "[start]" not in text
-    assert [line.split("#")[1][:5] for line in text.splitlines() if "[[" in line] == [
-        " 1: t",
-        " 2: t",
-        " 3: t",
-    ]
+    headings = [line.split("#")[1][:5] for line in text.splitlines() if "[[" in line]
+    assert headings == [" 1: t", " 2: t", " 3: t"]
 
 
 def test_route_along_curved_borders_is_the_whole_plan(
