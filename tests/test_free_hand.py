@@ -7,7 +7,6 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.integrate import quad
 
 from plane import finger_gap, make_scene, rotate
 from planned import change, plan
+from rows import each
 from shipped import HEXAGON, text_of
 from wholearm import Formation, Problem, TorqueProfile, Trajectory, simulate, simulate_free, verify
 from wholearm.cli.command import main
@@ -26,24 +26,12 @@ from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Finger, Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
-from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.system import ContactPair, Structure, System, build_system, measure_gaps
-from wholearm.verification.free import FreeReport, verify_free
-
-DURATION = 0.4
-"""Of a random run [s]."""
+from wholearm.verification.free import verify_free
 
 
-class Draw(NamedTuple):
-    """A random scene with a state and torques to start from."""
-
-    problem: Problem
-    state: Array
-    torque: TorqueProfile
-    restitution: float
-
-
-def draw_run(seed: int) -> Draw:
+def throw(seed: int) -> Simulation:
     """A random object that is thrown into a hand, which moves by random torques."""
     rng = np.random.default_rng([17, seed])
     count, size = int(rng.integers(3, 8)), 0.05
@@ -70,17 +58,14 @@ def draw_run(seed: int) -> Draw:
         z[:3] = rng.uniform(-0.05, 0.05), rng.uniform(0.05, 0.25), turn
         z[3:] = rng.uniform(0, np.pi / 2), rng.uniform(np.pi / 2, np.pi)
     v = rng.choice([0.0, 1.0]) * rng.normal(size=5) * [0.5, 0.5, 5.0, 3.0, 3.0]
-    breaks = np.linspace(0, DURATION, 5)
     coefficients = rng.normal(size=(4, 2, 2)) * rng.choice([0.0, 0.05, 0.5])
+    torque = TorqueProfile(np.linspace(0, 0.4, 5), coefficients)
     problem = Problem("random", scene, 0.05, z, (), checked=True)
-    restitution = float(rng.choice([0.0, rng.uniform(0, 0.9)]))
-    return Draw(problem, np.concatenate([z, v]), TorqueProfile(breaks, coefficients), restitution)
+    restitution = rng.choice([0.0, rng.uniform(0, 0.9)])
+    return simulate_free(problem, torque, start=np.append(z, v), restitution=float(restitution))
 
 
-NAMES = ("v0-palm", "v1-finger1", "v3-finger2", "e0-tip1", "v2-tip2")
-
-
-@pytest.mark.parametrize("name", NAMES)
+@each("name", ["v0-palm", "v1-finger1", "v3-finger2", "e0-tip1", "v2-tip2"])
 def test_pairs_are_the_contacts_that_problems_name(name: str) -> None:
     scene = make_scene()
     system, formation = build_system(scene), Formation(scene, (parse_contact(name, scene),))
@@ -180,11 +165,10 @@ def test_a_law_is_sampled_held_and_late(share: float) -> None:
 
 @pytest.mark.parametrize("seed", [3, 103, 512])
 def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
-    draw = draw_run(seed)
-    run = simulate_free(draw.problem, draw.torque, start=draw.state, restitution=draw.restitution)
+    run = throw(seed)
     assert run.outcome.kind is OutcomeKind.ENDED and run.residual < 1e-9
     # Relative to all that has moved: no energy is gained over what torques did, or unexplained.
-    scene, energies = draw.problem.scene, run.energies
+    scene, energies = run.problem.scene, run.energies
     kinetic, left = 0.5 * run.z_dot**2 @ scene.mass_diagonal, energies.stored - energies.work
     size = kinetic.max() + np.abs(energies.stored).max() + np.abs(energies.work).max()
     assert (left - np.minimum.accumulate(left)).max() < 1e-8 * size
@@ -214,41 +198,26 @@ def test_what_is_held_at_the_limit_of_friction_rests() -> None:
 def begin() -> tuple[Problem, Trajectory]:
     """The first two phases of a plan."""
     problem, trajectory = plan(pieces=12)
-    count = int(np.searchsorted(trajectory.torque.breaks, 0.8))
-    torque = TorqueProfile(
-        trajectory.torque.breaks[: count + 1], trajectory.torque.coefficients[:count]
-    )
+    torque = trajectory.torque.cut(0.0, 0.8)
     two = dataclasses.replace(problem, phases=problem.phases[:2])
     meta = {"epsilon": problem.epsilon, "problem": two.table}
     return two, assemble(list(trajectory.motions[:2]), torque, meta, 201)
 
 
-TOLD: list[str] = []
-
-
-@lru_cache
-def checked() -> FreeReport:
-    return verify_free(*begin(), progress=TOLD.append)
-
-
-def test_phases_of_a_plan_are_as_told() -> None:
-    report = checked()
-    assert TOLD == ["simulating the whole", *(f"simulating phase {k} of 2" for k in (1, 2))]
+def test_phases_of_a_plan_are_as_told_contact_by_contact() -> None:
+    told: list[str] = []
+    report = verify_free(*begin(), progress=told.append)
+    assert told == ["simulating the whole", *(f"simulating phase {k} of 2" for k in (1, 2))]
     assert report.ok and report.exit_status == 0 and len(report.alone) == 2
     for phase in report.alone:
         assert phase.reached and phase.losses == () and phase.deviation is not None
         # The interpolated torques are good to about 1e-11.
         assert phase.deviation.position < 1e-9 and phase.deviation.angle < 1e-9
-
-
-def test_a_report_says_what_happens_contact_by_contact() -> None:
-    report = checked()
     text, plain = report.to_text(), json.loads(json.dumps(report.to_dict()))
     assert text.startswith("heptagon, four contacts: ok: from its planned start each phase keeps")
     assert plain["ok"] and len(plain["events"]) == len(report.whole.events)
-    assert {row["contact"] for row in plain["contacts"]} >= set(
-        report.whole.problem.phases[0].formation.names
-    )
+    names = {row["contact"] for row in plain["contacts"]}
+    assert names >= set(report.whole.problem.phases[0].formation.names)
     first = report.whole.stretches[0]
     assert first.start == 0.0 and first.least > 0
 
@@ -268,8 +237,8 @@ def test_torques_alone_are_followed_by_what_happens() -> None:
     assert report.whole.outcome.kind is OutcomeKind.ENDED
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
+@each(
+    "options, message",
     [
         ({"restitution": 1.5}, "restitution: 1.5 is not between 0 and 1"),
         ({"until": 0.0}, "until"),
@@ -327,10 +296,9 @@ def make_body(
     *,
     mu: float = 0.0,
     inertia: float = 1.0,
-    mass: float = 1.0,
     weight: tuple[float, float] = (0.0, -G),
 ) -> System:
-    """One body (x, y, phi), whose corners are given about its centroid.
+    """One body (x, y, phi) of 1 kg, whose corners are given about its centroid.
 
     A line is given by its distance from the origin and its normal, which points to the body.
     """
@@ -347,12 +315,12 @@ def make_body(
     return System(
         structure,
         np.zeros(0),
-        np.array([mass, mass, inertia]),
-        mass * np.array([*weight, 0.0]),
+        np.array([1.0, 1.0, inertia]),
+        np.array([*weight, 0.0]),
         none,
         none,
         np.full(len(pairs), mu),
-        Scales.of(np.sqrt(inertia / mass), mass, mass * G),
+        Scales.of(np.sqrt(inertia), 1.0, G),
     )
 
 
@@ -435,11 +403,10 @@ def test_a_ladder_leaves_the_wall() -> None:
     last = np.arcsin(2 / 3 * np.sin(start))
     # With elevation e: e'^2 = 3 g / (2 a) (sin e_0 - sin e); s^2 = e_0 - e takes the root away.
     e_0 = np.pi - start
-    root = np.sqrt(1.5 * G / a)
 
     def slowness(s: float) -> float:
-        e = e_0 - s * s
-        return float(2 * s / (root * np.sqrt(np.sin(e_0) - np.sin(e)))) if s else 0.0
+        fall = np.sin(e_0) - np.sin(e_0 - s * s)
+        return float(2 * s / np.sqrt(1.5 * G / a * fall)) if s else 0.0
 
     time = quad(slowness, 0, np.sqrt(e_0 - last), epsabs=1e-12)[0]
     assert lost.contact == "v1-line1" and lost.time == pytest.approx(time, abs=CLOSE)
@@ -455,8 +422,7 @@ def test_a_corner_bounces() -> None:
     fall, speed = np.sqrt(2 * height / G), np.sqrt(2 * height * G)
     hits = [event for event in run.events if event.kind is EventKind.IMPACT]
     count = 12
-    powers = e ** np.arange(1, count)
-    times = fall + np.append(0, 2 * np.cumsum(powers) * speed / G)
+    times = fall + np.append(0, 2 * np.cumsum(e ** np.arange(1, count)) * speed / G)
     assert [hit.time for hit in hits[:count]] == pytest.approx(times, abs=CLOSE)
     speeds = [hit.value for hit in hits[:count]]
     assert speeds == pytest.approx(speed * e ** np.arange(count), abs=CLOSE)
@@ -482,9 +448,8 @@ def test_a_corner_that_rises_past_the_end_of_a_table(enters: float, lands: bool)
     system = make_body([(0.0, 0.0)])
     (pair,), z = system.structure.pairs, system.structure.z
     pairs = (dataclasses.replace(pair, ranges=(z[0],)),)
-    system = dataclasses.replace(
-        system, structure=dataclasses.replace(system.structure, pairs=pairs)
-    )
+    structure = dataclasses.replace(system.structure, pairs=pairs)
+    system = dataclasses.replace(system, structure=structure)
     unit = system.scales.time
     up, down, speed = 0.003 * unit, 0.015 * unit, 1 / unit
     start = [-speed * enters * unit, -G * up * down / 2, 0.0]
@@ -531,15 +496,13 @@ class Rod:
     def __init__(self, share: float, turn: float = 0.0) -> None:
         a, phi, slide = 0.5, 1.1, -3.0
         limit = (1 + 3 * np.cos(phi) ** 2) / (3 * np.sin(phi) * np.cos(phi))
-        mu = share * limit
-        self.reduced = 1 + 3 * np.cos(phi) ** 2 - 3 * mu * np.sin(phi) * np.cos(phi)
-        self.system = make_body([(-a, 0), (a, 0)], mu=mu, inertia=a**2 / 3)
+        self.reduced = (1 + 3 * np.cos(phi) ** 2) * (1 - share)
+        self.system = make_body([(-a, 0), (a, 0)], mu=share * limit, inertia=a**2 / 3)
         r = -a * np.array([np.cos(phi), np.sin(phi)])
         self.rows = np.array([[0, 1, r[0]], [1, 0, -r[1]]])
-        self.z = [-r[0], -r[1], phi]
         self.v = [slide + turn * r[1], -turn * r[0], turn]
         self.falls = -G + a * np.sin(phi) * turn**2
-        self.run = simulate_body(self.system, self.z, self.v, 0.01)
+        self.run = simulate_body(self.system, [*-r, phi], self.v, 0.01)
 
 
 def test_a_rod_just_below_the_painleve_limit() -> None:

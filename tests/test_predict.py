@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 
 import wholearm
 from planned import change, plan
+from rows import each
 from scenes import box, constant, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, box_text, problem_of, text_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
@@ -24,7 +25,6 @@ from wholearm.analysis.slow_speeds import (
     OWN,
     PathSamples,
     Prediction,
-    Survival,
     UnitProfile,
     find_torques,
     make_torques,
@@ -53,12 +53,9 @@ def first_phase() -> Problem:
     return dataclasses.replace(problem, phases=problem.phases[:1])
 
 
-TOLD: list[str] = []
-
-
 @cache
 def predicted() -> Prediction:
-    return predict(first_phase(), progress=TOLD.append)
+    return predict(first_phase())
 
 
 @cache
@@ -105,9 +102,7 @@ def test_the_best_squeeze_is_that_of_a_linear_programme(path: Path, index: int) 
     assert grasp.least[rows] == pytest.approx(expected, rel=1e-6, abs=1e-7)
     known = np.isfinite(grasp.least)
     low, high = road.force_limits.find_span(a, b, grasp.least - 1e-3)
-    assert (low[known] <= grasp.internal_force[known]).all() and (grasp.internal_force <= high)[
-        known
-    ].all()
+    assert ((low <= grasp.internal_force) & (grasp.internal_force <= high))[known].all()
     low, high = road.force_limits.find_span(a, b, grasp.least + 1e-3)
     assert (low > high)[known].all()
 
@@ -145,16 +140,12 @@ def replay(speed: float) -> Simulation:
     return simulate(first_phase(), TorqueProfile.join_rows(t, tau))
 
 
-def paced() -> Survival:
-    return predicted().phases[0].survivals[1]
-
-
 def test_the_replay_holds_below_the_predicted_speed_and_not_above() -> None:
-    own, (phase,) = paced(), predicted().phases
+    (phase,) = predicted().phases
+    own = phase.survivals[1]
     assert own.motion == "rest to rest" and own.speed is not None and own.lost is not None
-    assert own.speed < own.lost and own.duration == pytest.approx(
-        np.pi / 2 * phase.length / own.speed
-    )
+    assert own.speed < own.lost
+    assert own.duration == pytest.approx(np.pi / 2 * phase.length / own.speed)
     below = replay(0.98 * own.speed)
     assert not below.find(EventKind.CONTACT_LOST)
     assert phase.curves is not None
@@ -200,14 +191,14 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     arguments = ["predict", str(file), "-o", str(figure), "--torques", str(table), "--json"]
     assert main(arguments) == 0
     values = json.loads(capsys.readouterr().out)
-    (phase,) = values["phases"]
-    assert phase["is_kept"] and phase["survivals"][1]["speed"] == pytest.approx(paced().speed)
+    (phase,), (own,) = values["phases"], predicted().phases
+    speed = phase["survivals"][1]["speed"]
+    assert phase["is_kept"] and speed == pytest.approx(own.survivals[1].speed)
     assert "<svg" in figure.read_text(encoding="utf-8")
-    profile = make_torques(predicted(), 0.05)
-    assert profile.duration == pytest.approx(predicted().phases[0].length / 0.05)
+    assert make_torques(predicted(), 0.05).duration == pytest.approx(own.length / 0.05)
     assert table.read_text(encoding="utf-8").startswith("t,tau1,tau2\n")
     printed = predicted().to_text()
-    for survival in predicted().phases[0].survivals:
+    for survival in own.survivals:
         assert f"{survival.motion}" in printed and survival.first.name in printed
     assert OWN in printed and "all along" in printed
     assert main(["predict", str(file), "--squeeze", "2"]) == 2
@@ -286,8 +277,8 @@ def test_constant_torques_do_not_come_to_rest() -> None:
         found.to_csv()
 
 
-@pytest.mark.parametrize(
-    ("given", "wrong"),
+@each(
+    "given, wrong",
     [
         ({"stops": 8, "brake": True}, "stops: 8 given; allowed are 0 to 7"),
         ({"stops": -1, "brake": True}, "allowed are 0 to 7"),
@@ -313,7 +304,7 @@ def test_stops_are_no_more_than_allowed() -> None:
 
 def test_phases_that_nothing_stops_are_tuned_as_one() -> None:
     parts, others = (
-        [[phase.number for phase in passage.phases] for passage in split_passages(problem_of(path))]
+        [[phase.number for phase in own.phases] for own in split_passages(problem_of(path))]
         for path in (LANDING, HEXAGON)
     )
     assert parts == [[1], [2], [3], [4], [5, 6]]
@@ -336,10 +327,6 @@ def test_shipped_torques_hold_every_contact(path: Path, torques: str) -> None:
     assert not report.whole.z_dot[-1].any()
 
 
-EARLY = 1 - 1e-6
-"""Time of a step of the torques, over that of the loss which it is to mend."""
-
-
 @cache
 def let_go() -> Report:
     """Finger 2 is lowered until it lets go."""
@@ -349,58 +336,47 @@ def let_go() -> Report:
 
 def step(torque: TorqueProfile, time: float, by: Array) -> TorqueProfile:
     """Torques that change by `by`, shape (2,) [N m], from a time on."""
-    before = torque.breaks[torque.breaks < time]
-    after = torque.breaks[torque.breaks > time]
-    parts = [np.append(before, time), np.append(time, after)]
-    degree = torque.coefficients.shape[2] - 1
-    early, late = (TorqueProfile.fit(part, torque.at, degree) for part in parts)
+    early, late = torque.cut(0.0, time), torque.cut(time, torque.duration)
     late.coefficients[:, :, 0] += by
     joined = np.concatenate([early.coefficients, late.coefficients])
-    return TorqueProfile(np.append(before, late.breaks), joined)
+    return TorqueProfile(np.append(early.breaks[:-1], late.breaks), joined)
 
 
-def forces_at_step(problem: Problem, report: Report, loss: Loss, by: Array) -> tuple[Array, Array]:
+def forces_at_step(
+    problem: Problem, torque: TorqueProfile, loss: Loss, by: Array
+) -> tuple[Array, Array]:
     """Normal forces before and after a step of the torques right before a loss, (n_c,) each."""
-    assert isinstance(report.replay, Simulation)
-    time = EARLY * loss.time
-    simulation = simulate(problem, step(report.replay.torque, time, by))
+    time = (1 - 1e-6) * loss.time
+    simulation = simulate(problem, step(torque, time, by))
     own = [simulation.contacts.index(force.contact) for force in loss.forces]
     before, after = np.flatnonzero(simulation.t == time)
     return simulation.c_n[before, own], simulation.c_n[after, own]
 
 
-def test_sensitivities_are_those_of_the_simulation() -> None:
-    report = let_go()
-    (loss,) = (loss for loss in report.help.losses if loss.kind == "lost")
-    assert loss.contact == "v5-finger2" and not loss.at_rest and loss.phase == 1
-    assert loss.time == pytest.approx(report.replay.t[-1])  # type: ignore[union-attr]
-    per_tau = np.array([force.per_tau for force in loss.forces])
-    for by in np.array([[0.01, 0.0], [0.0, -0.01], [0.02, 0.003]]):
-        before, after = forces_at_step(first_phase(), report, loss, by)
-        assert after - before == pytest.approx(per_tau @ by, rel=1e-4, abs=1e-6)
-        assert before == pytest.approx([force.c_n for force in loss.forces], abs=1e-4)
-
-
-def test_following_the_advice_mends_the_loss() -> None:
+def test_sensitivities_are_those_of_the_simulation_and_advice_mends_the_loss() -> None:
     problem, report = first_phase(), let_go()
     (loss,) = (loss for loss in report.help.losses if loss.kind == "lost")
+    assert loss.contact == "v5-finger2" and not loss.at_rest and loss.phase == 1
+    assert isinstance(report.replay, Simulation)
+    assert loss.time == pytest.approx(report.replay.t[-1])
+    per_tau = np.array([force.per_tau for force in loss.forces])
+    for by in np.array([[0.01, 0.0], [0.0, -0.01], [0.02, 0.003]]):
+        before, after = forces_at_step(problem, report.replay.torque, loss, by)
+        assert after - before == pytest.approx(per_tau @ by, rel=1e-4, abs=1e-6)
+        assert before == pytest.approx([force.c_n for force in loss.forces], abs=1e-4)
     names = [force.contact for force in loss.forces]
     good = [change for change in loss.changes if not change.but]
     assert good and loss.changes[0] is good[0]
+    (tau,) = report.replay.torque.at(np.array([loss.time]))
     for mend in loss.changes:
-        _, after = forces_at_step(problem, report, loss, np.array(mend.change))
+        _, after = forces_at_step(problem, report.replay.torque, loss, np.array(mend.change))
         assert after[names.index(loss.contact)] == pytest.approx(problem.epsilon, rel=1e-3)
         assert (after.min() < 0.999 * problem.epsilon) == bool(mend.but)
-        assert mend.to == pytest.approx(np.array(mend.change) + tau_at(report, loss))
+        assert mend.to == pytest.approx(np.array(mend.change) + tau)
     text = report.to_text()
     assert f"help: {loss.to_text()}" in text and good[0].to_text() in text
     assert "acceleration to v3-finger1" in text
     assert report.to_dict()["help"]["losses"][0]["changes"][0]["but"] == ""
-
-
-def tau_at(report: Report, loss: Loss) -> Array:
-    assert isinstance(report.replay, Simulation)
-    return np.asarray(report.replay.torque.at(np.array([loss.time]))[0])
 
 
 @pytest.mark.parametrize("tau", [(0.05, 0.05), (-0.2, 0.0), (0.9, 0.1), (-0.2, 0.2)])
@@ -430,8 +406,7 @@ def test_a_rolling_contact_is_mended(kind: str, first: float, second: float) -> 
     # It slips at the edge of its cone, or beyond.
     assert abs(loss.forces[k].c_t) > mu * loss.forces[k].c_n * (1 - 1e-6)
     mend = loss.changes[0]
-    assert not mend.but
-    assert isinstance(report.replay, Simulation)
+    assert not mend.but and isinstance(report.replay, Simulation)
     # The torques step here already.
     torque = step(report.replay.torque, loss.time, np.array(mend.change))
     simulation = simulate(problem, torque)
@@ -482,15 +457,14 @@ PUSH = constant((0.3, 0.0), 0.5)
 
 def write(folder: Path) -> list[str]:
     """A replay of `PUSH`, its torques with a note, torques that let go, and such that hold."""
-    paths = [str(folder / name) for name in ("moved.npz", "noted.csv", "lost.csv", "still.csv")]
-    save(simulate(first_phase(), PUSH), paths[0])
-    for path, torque in zip(
-        paths[1:], (PUSH, constant((0.05, 0.05), 0.5), constant((0.0, 0.0), 0.5)), strict=True
-    ):
+    weak, none = constant((0.05, 0.05), 0.5), constant((0.0, 0.0), 0.5)
+    moved, *others = [folder / name for name in ("moved.npz", "noted.csv", "lost.csv", "still.csv")]
+    save(simulate(first_phase(), PUSH), moved)
+    for path, torque in zip(others, (PUSH, weak, none), strict=True):
         save(torque, path)
-    noted = Path(paths[1])
-    noted.write_text("# simulations = 37\n" + noted.read_text(encoding="utf-8"), encoding="utf-8")
-    return paths
+    text = others[0].read_text(encoding="utf-8")
+    others[0].write_text("# simulations = 37\n" + text, encoding="utf-8")
+    return [str(path) for path in (moved, *others)]
 
 
 def test_figures_are_those_of_verify(tmp_path: Path) -> None:
@@ -548,24 +522,23 @@ def test_what_differs_from_the_problem_of_a_plan_is_said(
     text = describe_origin(other, meta)
     assert text.startswith("made for another problem: object.mass (0.2 in the plan, 0.3 here)")
     assert "fingers.1.length" in text
-    vertices = [*problem.table["object"]["vertices"]]
-    chipped = problem.table["object"] | {"vertices": vertices[:-1]}
+    body = problem.table["object"]
+    chipped = body | {"vertices": body["vertices"][:-1]}
     for senseless, key in (
         ({"length1": problem.scene.fingers[0].length * 1.5}, "fingers.1.length"),
-        ({"base2": [-0.5, 0.1]}, r"fingers.2.base"),
+        ({"base2": [-0.5, 0.1]}, "fingers.2.base"),
     ):
+        table = change_table(meta["problem"], senseless, name_keys())
         with pytest.raises(InputError, match=f"{key}.*another hand"):
-            describe_origin(
-                problem, {"problem": change_table(meta["problem"], senseless, name_keys())}
-            )
+            describe_origin(problem, {"problem": table})
     with pytest.raises(InputError, match=r"object\.vertices: 6 entries in the plan, 7 here"):
         describe_origin(problem, {"problem": meta["problem"] | {"object": chipped}})
     own = tmp_path / "own.toml"
     own.write_text(re.sub(r"(?m)^mass = .*", "mass = 0.21", text_of()), encoding="utf-8")
-    for command in (["verify"], ["verify", "--json"]):
-        main([command[0], str(own), moved, *command[1:]])
+    for options in ([], ["--json"]):
+        main(["verify", str(own), moved, *options])
         out = capsys.readouterr().out
-        notes = json.loads(out)["notes"] if command[1:] else out.splitlines()[:1]
+        notes = json.loads(out)["notes"] if options else out.splitlines()[:1]
         assert notes == ["made for another problem: object.mass (0.2 in the plan, 0.21 here)"]
 
 
@@ -592,10 +565,9 @@ def test_a_replay_is_a_trajectory(simulation: Simulation, torque: TorqueProfile)
         near = np.abs(found.t - t).argmin()
         assert found.at(found.t[near]).z[0] == pytest.approx(found.z[near], abs=1e-12)
     times = np.linspace(0.01, 1.95, 41)
-    exact = simulate(simulation.problem, torque, times=times)
-    np.testing.assert_allclose(
-        found.at(times).z, [exact.at(t)[:5] for t in times], rtol=0, atol=1e-8
-    )
+    replay = simulate(simulation.problem, torque, times=times)
+    exact = [replay.at(t)[:5] for t in times]
+    np.testing.assert_allclose(found.at(times).z, exact, rtol=0, atol=1e-8)
 
 
 def test_a_replay_survives_its_file(simulation: Simulation, tmp_path: Path) -> None:
