@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.optimize import linprog
 from plane import SQUARE, make_formation, make_scene, with_speed_limit
 from rows import each
 from scenes import roll
-from wholearm import Objective
+from wholearm import Finger, Objective, Polygon, Scene
 from wholearm.common.arrays import Array, find_minima
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.closing import contact_table
@@ -44,7 +45,6 @@ from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.make import make_rows
 from wholearm.problem.definition import End, Phase, Problem, Until
-from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction
 from wholearm.search.edges import BorderEdge, Terms, estimate_duration, time_parts
 from wholearm.search.places import make_place
@@ -72,8 +72,7 @@ def test_a_parameter_moves_the_bounds_of_its_limits_by_their_weight(formation: F
             other = make_limits(formation, 0.1 - 1e-3)
         else:
             _, finger, key = parameter.key.split(".")
-            links = list(formation.scene.fingers)
-            k = int(finger) - 1
+            links, k = list(formation.scene.fingers), int(finger) - 1
             links[k] = replace(links[k], **{key: getattr(links[k], key) + 1e-3})
             scene = replace(formation.scene, fingers=(links[0], links[1]))
             other = make_limits(replace(formation, scene=scene), 0.1)
@@ -120,11 +119,8 @@ def motors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def strain(motion: PathMotion | TimeMotion, formation: Formation) -> Array:
     """|tau + k theta'| over the torque limits, shape (n, 2)."""
-    samples, scales = (
-        motion.evaluate(np.linspace(0.0, motion.duration, 2001)),
-        formation.scene.scales,
-    )
-    droop = DROOP * scales.torque * scales.time
+    samples = motion.evaluate(np.linspace(0.0, motion.duration, 2001))
+    droop = DROOP * formation.scene.scales.torque * formation.scene.scales.time
     driven = samples.tau + droop * samples.z_dot[:, 3:]
     return np.asarray(np.abs(driven) / formation.scene.torque_limit)
 
@@ -227,15 +223,9 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
         border = BorderEdge(place, curve, None, Terms(EPSILON, 0.0))
         least = bound_least_time([curve], EPSILON)
         assert least is not None
-        return np.array(
-            [
-                least.value,
-                look_along([curve], EPSILON, 50),
-                estimate_duration([border.limits]),
-                time_parts(border, np.array([1.0]))[0],
-                time_paths(formation.scene, epsilon, *path)[0],
-            ]
-        )
+        of_border = estimate_duration([border.limits]), time_parts(border, np.array([1.0]))[0]
+        of_cell = time_paths(formation.scene, epsilon, *path)[0]
+        return np.array([least.value, look_along([curve], EPSILON, 50), *of_border, of_cell])
 
     plain = measure(EPSILON)
     s = np.linspace(0.2, 0.8, 7) * curve.length
@@ -295,19 +285,15 @@ def test_slack_is_that_of_the_motion(curves: tuple[Curve, ...], phase: int) -> N
     np.testing.assert_array_equal(b <= found.cap, (slack[:, fast] >= 0).all(axis=1))
     # At the places of the curve with half of its parameter.
     halved = found.scale(0.5)
-    np.testing.assert_allclose(
-        halved.find_slack(2 * a, 4 * b, internal), slack[:, ~fast], atol=1e-9
-    )
+    room = halved.find_slack(2 * a, 4 * b, internal)
+    np.testing.assert_allclose(room, slack[:, ~fast], atol=1e-9)
     np.testing.assert_allclose(halved.cap, 4 * found.cap)
 
 
 def test_a_limit_of_both_joint_speeds_bounds_the_speed() -> None:
-    formation_rows = np.array([[0.0, 0.0, 0.0, 1.0, -1.0]])
-
-    class Sum:
-        rows, low, high = formation_rows, np.array([-3.0]), np.array([2.0])
-
-    limits = LimitSet((Sum(),))  # type: ignore[arg-type]
+    rows = np.array([[0.0, 0.0, 0.0, 1.0, -1.0]])
+    both: Any = SimpleNamespace(rows=rows, low=np.array([-3.0]), high=np.array([2.0]))
+    limits = LimitSet((both,))
     rates = np.array([[4.0, 2.0], [2.0, 5.0], [1.0, 1.0]])
     np.testing.assert_array_equal(find_speed_cap(limits, rates), [1.0, 1.0, np.inf])
 
@@ -471,20 +457,11 @@ def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
 
 def test_a_costate_that_falls_where_nothing_bounds_the_speed_ends_the_refinement() -> None:
     """There is no bound then, on any grid: intervals there were split until they had no length."""
-    link = {"length": 0.1522, "radius": 0.005435, "inertia": 0.00886, "viscous": 0.017}
-    link |= {"dry": 0.0163, "torque_limit": 3.261}
     corners = [[0.0, 0.0], [0.06, 0.0], [0.085, 0.05], [0.03, 0.095], [-0.015, 0.05]]
-    table: dict[str, Any] = {
-        "epsilon": 0.075,
-        "object": {"vertices": corners, "mass": 0.3},
-        "friction": dict.fromkeys(("palm", "finger1", "finger2"), 0.05),
-        "fingers": {"1": {"base": [0.08695, -0.01087]}, "2": {"base": [-0.08695, -0.01087]}},
-        "start": {"flush": 0, "x": 0.0163},
-        "goal": {"flush": 1},
-    }
-    table["fingers"] = {key: own | link for key, own in table["fingers"].items()}
-    problem = build_problem(table)
-    held, scene = "v1-palm v2-finger1 v3-finger1", problem.scene
+    link = Finger((0.08695, -0.01087), 0.1522, 0.005435, 0.00886, 0.017, 0.0163, 3.261)
+    fingers = link, replace(link, base=(-0.08695, -0.01087))
+    scene = Scene(Polygon(corners, 0.3), fingers, Friction(0.05, 0.05, 0.05))
+    held = "v1-palm v2-finger1 v3-finger1"
     formations = [
         make_formation(scene, f"{held} {c}") for c in ("v4-finger2", "v4-tip2", "e4-tip2")
     ]
@@ -495,7 +472,7 @@ def test_a_costate_that_falls_where_nothing_bounds_the_speed_ends_the_refinement
     for formation, contact in zip(formations, gained, strict=True):
         path.append(trace_phase(Phase(0, formation, Until(contact=contact), End.SMOOTH), z))
         z = path[-1].end
-    bound = bound_least_time(path, problem.epsilon)
+    bound = bound_least_time(path, 0.075)
     assert bound is not None and 0.0 <= bound.value < 1.0
 
 
@@ -519,13 +496,9 @@ def test_a_margin_that_a_place_limits_does_not_grow_with_the_duration(
     curve = curves[2]
     bound = bound_least_time([curve], EPSILON)
     assert bound is not None
-    at_once, at_leisure = (
-        plan_path(
-            curve, EPSILON, PlanOptions(Objective.MARGIN, intervals=40), 3, ratio * bound.value
-        ).value
-        for ratio in (2.0, 3.0)
-    )
-    assert at_leisure == pytest.approx(at_once, rel=5e-4)
+    options, durations = PlanOptions(Objective.MARGIN, intervals=40), np.array([2, 3]) * bound.value
+    one, other = (plan_path(curve, EPSILON, options, 3, own).value for own in durations.tolist())
+    assert other == pytest.approx(one, rel=5e-4)
 
 
 @each("nodes", [11, 81])

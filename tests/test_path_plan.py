@@ -159,21 +159,7 @@ def test_inertia_that_steps_at_a_reversal() -> None:
     np.testing.assert_allclose(motion.profile.a[[gap, gap + 1]], [-LIMIT, -LIMIT / 2], rtol=1e-3)
 
 
-PHASES = range(5)
 OBJECTIVES = ["time", "effort", "margin"]
-STRONG = 2.0
-COARSE = 20
-"""Intervals where only what a plan is for is looked at, not how good it is."""
-ALLOWED = 0.2
-"""Duration for the objective margin [s]: about twice the least time of each phase."""
-
-
-@cache
-def plan_line(
-    curve: Curve, objective: str = "time", intervals: int = COARSE
-) -> PhasePlan[PathMotion]:
-    options = PlanOptions(objective=objective, intervals=intervals)
-    return plan_path(curve, EPSILON, options, 1, ALLOWED if objective == "margin" else None)
 
 
 def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
@@ -226,9 +212,9 @@ def test_two_halves_are_one_whole(objective: str) -> None:
 
 @pytest.mark.parametrize("phase", [0, 3])
 def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> None:
-    motion = plan_line(curves[phase], "time", 80).motion
+    motion = plan_path(curves[phase], EPSILON, PlanOptions(intervals=80), 1).motion
     samples = motion.evaluate(np.linspace(0, motion.duration, 4001))
-    near = np.hstack([samples.c_n - EPSILON, STRONG - np.abs(samples.tau)]) < 1e-3
+    near = np.hstack([samples.c_n - EPSILON, LIMIT - np.abs(samples.tau)]) < 1e-3
     # All but the intervals in which it goes over from one limit to another; mostly two limits, of
     # which one fixes the internal force.
     assert (near.sum(axis=1) >= 1).mean() > 0.95
@@ -237,7 +223,7 @@ def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> 
 
 @pytest.mark.parametrize("phase, objective", [(0, "effort"), (4, "margin")])
 def test_other_objectives_converge(curves: tuple[Curve, ...], phase: int, objective: str) -> None:
-    duration = ALLOWED if objective == "margin" else None
+    duration = 0.2 if objective == "margin" else None
     coarse, fine = (
         plan_path(curves[phase], EPSILON, PlanOptions(objective, accuracy=own), 1, duration)
         for own in (1e-4, 1e-5)
@@ -248,7 +234,7 @@ def test_other_objectives_converge(curves: tuple[Curve, ...], phase: int, object
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("phase", range(5))
 def test_torques_do_not_jitter(phase: int, objective: str) -> None:
     motion = plan_of(HEPTAGON, objective).motions[phase]
     assert isinstance(motion, PathMotion)

@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 
 import wholearm
 from scenes import PENTAGON
-from shipped import HEPTAGON, HEXAGON, IMPACTS, LANDING, plan_of, problem_of
+from shipped import HEPTAGON, HEXAGON, IMPACTS, LANDING, part_of, plan_of, problem_of
 from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajectory, Uncertainty
 from wholearm.analysis.robustness import make_trial
 from wholearm.cli.command import main
@@ -50,8 +50,7 @@ from wholearm.verification.free import find_losses, list_aliases, verify_policy
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     """The first two slides of the heptagon."""
-    whole = problem_of(HEPTAGON)
-    return whole.with_({"phases": list(whole.table["phases"][:2]), "epsilon": 0.2})
+    return part_of(problem_of(HEPTAGON), 0, 2).with_(epsilon=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +105,7 @@ def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
 
 
 def test_the_joints_show_an_impact() -> None:
-    one, two, *_ = problem_of(IMPACTS).table["phases"]
-    problem = problem_of(IMPACTS).with_({"phases": [one, {**two, "end": "rest"}]})
+    problem = part_of(problem_of(IMPACTS), 0, 2).with_({"phases[2].end": "rest"})
     plan = wholearm.solve(problem, replay=False).trajectory
     policy = make_policy(problem, plan)
     first, second = policy.laws
@@ -115,14 +113,11 @@ def test_the_joints_show_an_impact() -> None:
     # The reference goes on as fast as the impact of the plan leaves it.
     k = int(np.flatnonzero(plan.phase == 1)[0])
     ratio = np.linalg.norm(plan.theta_dot[k]) / np.linalg.norm(plan.theta_dot[k - 1])
-    speeds = [
-        np.sqrt(b) * np.hypot(*chord) / step
-        for b, chord, step in (
-            (first.b[-1], first.chords[-1], first.steps[-1]),
-            (second.b[0], second.chords[0], second.steps[0]),
-        )
-    ]
-    assert speeds[1] / speeds[0] == pytest.approx(ratio, rel=0.02)
+    before, after = (
+        np.sqrt(law.b[k]) * np.hypot(*law.chords[k]) / law.steps[k]
+        for law, k in ((first, -1), (second, 0))
+    )
+    assert after / before == pytest.approx(ratio, rel=0.02)
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
     made = min(own.start for own in report.whole.stretches if own.contact == "v3-finger1")
@@ -149,10 +144,15 @@ def test_a_policy_keeps_contacts_where_numbers_are_off(
     assert end is not None and end.position < 1e-3
 
 
+def draw(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The accelerations of two coordinates in proportion to their state and to both torques."""
+    rng = np.random.default_rng(seed)
+    B, rates = rng.normal(size=(2, 2)), rng.normal(size=(2, 4))
+    return np.vstack([np.eye(2, 4, 2), rates]), B
+
+
 def test_gains_are_those_of_the_riccati_equation() -> None:
-    rng = np.random.default_rng(6)
-    A, B = np.zeros((4, 4)), rng.normal(size=(2, 2))
-    A[:2, 2:], A[2:] = np.eye(2), rng.normal(size=(2, 4))
+    A, B = draw(6)
     cost, N = np.diag([1.0, 2.0]), np.vstack([np.zeros((3, 2)), np.eye(2)])
     step = 1e-4
     gains = regulate([Linear([3, 4], N, np.eye(2), A, B, cost)] * 50, step) * (1 + DAMPING**2)
@@ -165,9 +165,7 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
 
 
 def test_joints_that_hardly_move_with_the_object_cause_no_large_torques() -> None:
-    rng = np.random.default_rng(7)
-    A, B = np.zeros((4, 4)), rng.normal(size=(2, 2))
-    A[:2, 2:], A[2:] = np.eye(2), rng.normal(size=(2, 4))
+    A, B = draw(7)
 
     def find_gains(seen: float) -> np.ndarray:
         # The joints move as (1, 0) and `seen` times (0, 1).
@@ -225,7 +223,7 @@ def test_a_contact_presses_under_the_name_of_the_neighbour_that_it_goes_on_from(
 
 
 def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> None:
-    own = problem.with_({"settle": 0.01, "phases": problem.table["phases"][:1]})
+    own = part_of(problem, 0, 1).with_(settle=0.01)
     plan = wholearm.solve(own, replay=False).trajectory
     assert plan.held.any()
     (law,) = make_policy(own, plan).laws
@@ -234,8 +232,7 @@ def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> N
 
 def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
     # A link passes with its side, over its tip, to an edge.
-    text = "[[phases]]".join(PENTAGON.split("[[phases]]")[:5])
-    problem = build_problem(tomllib.loads(text))
+    problem = part_of(build_problem(tomllib.loads(PENTAGON)), 0, 4)
     plan = wholearm.solve(problem, replay=False).trajectory
     policy = make_policy(problem, plan)
     assert [len(law.starts) for law in policy.laws] == [1, 3]
@@ -311,21 +308,20 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     report = verify_policy(problem, plan.trajectory, weak)
     monkeypatch.setattr("wholearm.verify_policy", lambda *_, **__: report)
     output = tmp_path / "policy.npz"
-    assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
+    command = ["policy", str(tmp_path / "plan.npz"), "-o", str(output)]
+    assert main(command) == 1
     said = capsys.readouterr().err
     assert "no policy is written" in said and "phase 2, and opens by" in said
     tried = "--period 0.0002 --delay 0, --reserve 1.25, a plan with epsilon = 0.4 N"
     assert f"{tried} would not do either; --write-anyway" in said
     assert not output.exists()
-    given = ["policy", str(tmp_path / "plan.npz"), "-o", str(output), "--write-anyway"]
-    assert main(given) == 0
+    assert main([*command, "--write-anyway"]) == 0
     assert "phase 2, and opens by" in capsys.readouterr().err
     assert any("opens by" in text for text in Policy.load(output).about["failures"])
 
 
 def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
-    phases = [{**problem.table["phases"][0], "until": {"x": 0.01}}]
-    own = problem.with_({"phases": phases})
+    own = part_of(problem, 0, 1).with_({"phases[1].until": {"x": 0.01}})
     tau = hold_end(own, own.phases[0], own.start)
     assert tau is not None
     torque = TorqueProfile(np.array([0.0, 0.05]), tau[None, :, None])
@@ -365,16 +361,14 @@ def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:
     assert report.ok, report.failures
 
 
-RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4} | dict.fromkeys(
-    ("geometry", "gain", "delay"), 0.0
-)
+RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4}
+RANGES |= dict.fromkeys(("geometry", "gain", "delay"), 0.0)
 
 
 @pytest.fixture(scope="module")
 def ranged() -> Problem:
     """The first slide of the heptagon."""
-    whole = problem_of(HEPTAGON)
-    return whole.with_({"phases": list(whole.table["phases"][:1]), "uncertainty": RANGES})
+    return part_of(problem_of(HEPTAGON), 0, 1).with_(uncertainty=RANGES)
 
 
 @pytest.fixture(scope="module")
@@ -383,9 +377,8 @@ def ranged_plan(ranged: Problem) -> Trajectory:
 
 
 def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
-    widths = {"mass": 0.1, "inertia": 0.1} | {
-        f"friction_{part}": 0.2 for part in ("palm", "finger1", "finger2")
-    }
+    widths = dict.fromkeys(("friction_palm", "friction_finger1", "friction_finger2"), 0.2)
+    widths |= {"mass": 0.1, "inertia": 0.1}
     curve = trace_phase(ranged.phases[0], ranged.start, ())
     s = curve.length * np.array([0.1, 0.2, 0.3])
     within = find_within(curve, s, np.zeros(3), widths, ranged.epsilon)
@@ -394,10 +387,8 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     tau = np.einsum("nfq,nq->nf", within.torque, known)
     point, part = curve.evaluate(s), curve.segments[0]
     assert part.stop > s[-1]
-    z_dot, signs = (
-        point.z_s * np.sqrt(b)[:, None],
-        [np.tile(own, (3, 1)).T for own in (part.Xi, part.sigma)],
-    )
+    z_dot = point.z_s * np.sqrt(b)[:, None]
+    signs = [np.tile(own, (3, 1)).T for own in (part.Xi, part.sigma)]
     least, scenes = np.full((3, 4), np.inf), list_scenes(ranged.scene, widths)
     assert len(scenes) == 32
     for scene in scenes:

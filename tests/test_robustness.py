@@ -21,7 +21,7 @@ import pytest
 import wholearm
 from retelling import Retelling, Units
 from rows import each
-from shipped import BOX, FOLDER, HEPTAGON, problem_of, text_of
+from shipped import BOX, FOLDER, HEPTAGON, part_of, problem_of, text_of
 from wholearm import Formation, InputError, Plan, PlanOptions, Problem, Scene, TorqueProfile
 from wholearm.analysis.robustness import (
     Robustness,
@@ -68,8 +68,7 @@ THREADS: Callable[[], Executor] = partial(ThreadPoolExecutor, 2)
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     """The first slide of the heptagon alone."""
-    whole = problem_of(HEPTAGON)
-    return whole.with_({"phases": [whole.table["phases"][0]], "epsilon": 0.3})
+    return part_of(problem_of(HEPTAGON), 0, 1).with_(epsilon=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -162,18 +161,13 @@ def test_sensitivities_are_those_of_the_simulator_that_is_told_contacts(
     ],
 )
 def test_bad_options_are_named(
-    plan: Plan,
-    options: list[str],
-    text: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    plan: Plan, options: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    plan.save("plan.npz")
+    path, file = tmp_path / "one.toml", tmp_path / "plan.npz"
+    plan.save(file)
     # The file as far as the second phase.
-    Path("one.toml").write_text(text_of(), encoding="utf-8")
-    assert main(["robustness", "one.toml", "plan.npz", *options]) == 2
+    path.write_text(text_of(), encoding="utf-8")
+    assert main(["robustness", str(path), str(file), *options]) == 2
     assert text in capsys.readouterr().err
 
 

@@ -499,17 +499,16 @@ def test_route_that_starts_in_a_cell_is_led_there(heptagon: Problem, tmp_path: P
 
 
 def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
-    start = (float(heptagon.start[0]), float(heptagon.start[2]))
-    with pytest.raises(InputError, match=r"leg 1 cannot be followed .* finger 2 is too short"):
-        list_formations(heptagon, start, (0.2, 0.2))
-    with pytest.raises(InputError, match="two or more"):
-        list_formations(heptagon, start)
-    with pytest.raises(InputError, match="same place"):
-        list_formations(heptagon, start, start)
-    with pytest.raises(InputError, match=r"cannot start at .*: finger 1 is too short"):
-        list_formations(heptagon, (0.4, start[1]), start)
-    with pytest.raises(InputError, match=r"route: -63\.7 given; allowed are .* m "):
-        list_formations(heptagon, start, (-63.7, start[1]))
+    x, phi = heptagon.start[[0, 2]].tolist()
+    for words, *poses in (
+        ("leg 1 cannot be followed .* finger 2 is too short", (x, phi), (0.2, 0.2)),
+        ("two or more", (x, phi)),
+        ("same place", (x, phi), (x, phi)),
+        ("cannot start at .*: finger 1 is too short", (0.4, phi), (x, phi)),
+        (r"route: -63\.7 given; allowed are .* m ", (x, phi), (-63.7, phi)),
+    ):
+        with pytest.raises(InputError, match=words):
+            list_formations(heptagon, *poses)
 
 
 def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:

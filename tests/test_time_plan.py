@@ -70,7 +70,6 @@ from wholearm.geometry.path_guess import close_contacts
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.mechanics.impact import compute_impact
-from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages, list_stages
 from wholearm.planning.time_domain.mode_search import link
@@ -93,18 +92,8 @@ SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 3)]
 
 
 @pytest.fixture(scope="module")
-def motions() -> list[TimeMotion]:
-    return fastest_landing()
-
-
-@pytest.fixture(scope="module")
-def stages(motions: list[TimeMotion]) -> list[StageMotion]:
-    return [stage for motion in motions for stage in motion.stages]
-
-
-@pytest.fixture(scope="module")
-def coarse() -> list[PhasePlan[TimeMotion]]:
-    return plan_landing(time_intervals=COARSE)
+def stages() -> list[StageMotion]:
+    return [stage for motion in fastest_landing() for stage in motion.stages]
 
 
 @once
@@ -303,9 +292,9 @@ def test_limits_hold_between_points_and_some_limit_is_used_all_along(
     assert np.mean(np.concatenate(used) < 0.05) > 0.75
 
 
-def test_the_released_contact_opens(motions: list[TimeMotion]) -> None:
+def test_the_released_contact_opens() -> None:
     gaps = make_formation(landing().scene, "v3-finger1")
-    before, after = motions
+    before, after = fastest_landing()
     t = np.linspace(0.0, after.duration, 200)
     opening = measure_gaps(gaps, after.evaluate(t).z)[:, 0]
     assert abs(opening[0]) < 1e-9 and opening.min() > -1e-9
@@ -349,9 +338,8 @@ def test_the_value_of_a_margin_is_the_least_force() -> None:
     assert plans[0].value > 5 * problem.epsilon
 
 
-def test_values_are_times_and_efforts_and_the_effort_of_a_gentle_plan_is_least(
-    coarse: list[PhasePlan[TimeMotion]],
-) -> None:
+def test_values_are_times_and_efforts_and_the_effort_of_a_gentle_plan_is_least() -> None:
+    coarse = plan_landing(time_intervals=COARSE)
     assert [plan.value for plan in coarse] == [plan.motion.duration for plan in coarse]
     gentle = plan_landing(objective="effort", time_intervals=COARSE)
     stages = stages_of(gentle)
@@ -401,13 +389,9 @@ def test_velocities_are_derivatives(stages: list[StageMotion]) -> None:
     for stage in stages:
         t, h = instants(stage, 10), 1e-3 * stage.duration / len(stage.points.fractions)
         around = [stage.evaluate(t + k * h) for k in (-2, -1, 1, 2)]
-        z_dot, z_ddot = (
-            (before2 - 8 * before + 8 * after - after2) / (12 * h)
-            for before2, before, after, after2 in (
-                [part.z for part in around],
-                [part.z_dot for part in around],
-            )
-        )
+        weights = np.array([1, -8, 8, -1]) / (12 * h)
+        z_dot = np.tensordot(weights, [part.z for part in around], 1)
+        z_ddot = np.tensordot(weights, [part.z_dot for part in around], 1)
         samples = stage.evaluate(t)
         # Pulling onto the contacts is no part of the derivative, nor is the error of collocation
         # that is spread over an interval part of the forces.
@@ -415,10 +399,9 @@ def test_velocities_are_derivatives(stages: list[StageMotion]) -> None:
         assert np.abs(z_ddot - samples.z_ddot).max() < 1e-3 * np.abs(samples.z_ddot).max()
 
 
-def test_stages_and_phases_pass_into_one_another(motions: list[TimeMotion]) -> None:
-    every = [stage for motion in motions for stage in motion.stages]
-    state = np.stack([every[0].points.nodes[0, 0], np.zeros(5)])
-    for stage in every:
+def test_stages_and_phases_pass_into_one_another(stages: list[StageMotion]) -> None:
+    state = np.stack([stages[0].points.nodes[0, 0], np.zeros(5)])
+    for stage in stages:
         # Rounding of velocities that count in the durations of two stages, and the tolerance of
         # the solver.
         np.testing.assert_allclose(stage.points.nodes[0], state, atol=1e-6)
@@ -745,10 +728,8 @@ def test_a_vertex_in_a_corner_may_go_back_first() -> None:
     assert verify(own, solve(own, time_intervals=6, replay=False)).ok
 
 
-def test_the_estimated_error_is_about_that_of_a_finer_plan(
-    coarse: list[PhasePlan[TimeMotion]],
-) -> None:
-    fine = plan_of(LANDING).meta
+def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
+    coarse, fine = plan_landing(time_intervals=COARSE), plan_of(LANDING).meta
     lost = total(coarse) / sum(fine["phase_durations"][4:]) - 1
     error = fine["phase_errors"][4]
     assert error < PlanOptions().accuracy < coarse[0].error == coarse[1].error

@@ -356,15 +356,11 @@ def test_torques_for_nothing() -> None:
     assert "-" in report.to_text()
 
 
-def test_torques_beyond_their_limit_are_a_warning() -> None:
+def test_torques_and_speeds_beyond_their_limits_are_warnings() -> None:
     problem, trajectory = plan()
     report = verify(problem.with_(torque_limit=1.0), trajectory.torque)
     assert report.ok
     assert any("above its limit 1 N m" in text for text in report.warnings)
-
-
-def test_speeds_beyond_their_limit_are_a_warning() -> None:
-    problem, trajectory = plan()
     rates = np.abs(trajectory.theta_dot[:, 0])
     limit = float(f"{0.9 * rates.max():.4g}")
     report = verify(problem.with_(speed_limit1=limit), trajectory.torque)
