@@ -15,9 +15,6 @@ from wholearm import Formation, Friction, Phase, Problem, Scene, TorqueProfile, 
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 
-FAR = Until(coordinate="x", value=-0.3)
-"""An end that is never reached."""
-
 
 @cache
 def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Problem:
@@ -30,7 +27,8 @@ def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Pro
     scene = Scene(scene.polygon, (scene.fingers[0], left), Friction(mu, 0.1, 0.1))
     q = place_flush(scene, 0, 0.0)
     z = np.array([*q, close_finger(scene, q, 0), np.pi / 2])
-    phase = Phase(0, make_formation(scene, contacts), FAR)
+    never = Until(coordinate="x", value=-0.3)
+    phase = Phase(0, make_formation(scene, contacts), never)
     return Problem("pushed box", scene, 0.0, z, (phase,))
 
 
@@ -70,20 +68,14 @@ class Push:
         x = self.problem.start[0] - (self.run if stage else 0.0)
         if stage == 1:
             return x, 0.0, 0.0
-        u, run = rate * (t - start), self.run
         if self.soft:
-            share = run / (2 * np.pi)
-            return (
-                x - share * (u - np.sin(u)),
-                -share * rate * (1 - np.cos(u)),
-                -share * rate**2 * np.sin(u),
-            )
-        u, rate = u / 2, rate / 2
-        return (
-            x - run / 2 * (1 - np.cos(u)),
-            -run / 2 * rate * np.sin(u),
-            -run / 2 * rate**2 * np.cos(u),
-        )
+            size, u = self.run / (2 * np.pi), rate * (t - start)
+            way, speed, growth = u - np.sin(u), 1 - np.cos(u), np.sin(u)
+        else:
+            size, rate = self.run / 2, rate / 2
+            u = rate * (t - start)
+            way, speed, growth = 1 - np.cos(u), np.sin(u), np.cos(u)
+        return x - size * way, -size * rate * speed, -size * rate**2 * growth
 
     def torque(self, t: float, stage: int) -> float:
         """Torque of finger 1 [N m]; within the cone while the box is still."""
@@ -99,10 +91,8 @@ class Push:
         v = np.array([x_dot, 0.0, 0.0, turn, 0.0])
         ahead = np.array([-1.0, 0.0, 0.0, normal[2, 0] / normal[2, 3], 0.0])
         Xi, sigma = np.sign(tangent @ ahead), np.array([np.sign(ahead[3]), 1.0])
-        first, second = (
-            accelerate(formation, z, v, np.array([tau, 1e-3]), Xi, sigma)[0][0]
-            for tau in (0.0, 1.0)
-        )
+        taus = np.array([[0.0, 1e-3], [1.0, 1e-3]])
+        first, second = (accelerate(formation, z, v, tau, Xi, sigma)[0][0] for tau in taus)
         return float((x_ddot - first) / (second - first))
 
     def fit(self) -> TorqueProfile:
@@ -129,8 +119,7 @@ class Roll:
         """X' and x of the vertex, phi' and phi."""
         start, stop = self.times[stage : stage + 2]
         u, rate = np.pi * (t - start) / (stop - start), np.pi / (stop - start)
-        x = (0.0, self.run, self.run)[stage]
-        slip = 0.0
+        x, slip = self.run if stage else 0.0, 0.0
         if stage != 1:
             x += self.run / 2 * (1 - np.cos(u))
             slip = self.run / 2 * rate * np.sin(u)

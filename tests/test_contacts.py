@@ -155,31 +155,21 @@ def test_closing_starts_from_straight_down(finger: int) -> None:
     assert abs(angle - (-np.pi / 2 if finger == 0 else 3 * np.pi / 2)) < np.pi / 4
 
 
-@pytest.mark.parametrize(
-    "height, angle_kind", [(0.05, "v-finger"), (0.1575, "e-tip"), (0.154, "v-tip")]
+@each(
+    "depth, x, y, names",
+    [
+        (0.0, 0.045, 0.05, {"v1-finger1", "v2-finger1"}),
+        (0.0, 0.07, 0.155, {"e0-tip1"}),
+        (0.0, 0.05 - np.sqrt(0.5) * 0.005, 0.15 + np.sqrt(0.5) * 0.005, {"v1-tip1"}),
+        # Vertex 1 lies on the line of the link's side, before the joint.
+        (0.05, 0.045, 0.03, {"v2-finger1"}),
+    ],
 )
-def test_touching_names_the_kind(height: float, angle_kind: str) -> None:
-    """A square beside the tip of an upright link: flush side, or above it."""
-    scene = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
-    if angle_kind == "v-finger":
-        z = np.array([0.08 - 0.005 - 0.03, height, 0.0, np.pi / 2, np.pi / 2])
-        names = {"v1-finger1", "v2-finger1"}
-    elif angle_kind == "e-tip":
-        z = np.array([0.08 - 0.01, 0.12 + 0.005 + 0.03, 0.0, np.pi / 2, np.pi / 2])
-        names = {"e0-tip1"}
-    else:
-        away = 0.005 * np.array([-np.sqrt(0.5), np.sqrt(0.5)])
-        z = np.array([*(np.array([0.08, 0.12]) + away - [0.03, -0.03]), 0.0, *[np.pi / 2] * 2])
-        names = {"v1-tip1"}
-    assert {c.name for c in find_touching(scene, z) if c.finger == 0} == names
-
-
-def test_a_corner_behind_the_joint_does_not_touch() -> None:
-    """It lies on the line of the link's side, before the joint."""
-    scene = make_scene(SQUARE, base=0.08, depth=0.05, length=0.12)
-    z = np.array([0.045, 0.03, 0.0, np.pi / 2, np.pi / 2])
-    names = {c.name for c in find_touching(scene, z) if c.finger == 0}
-    assert names == {"v2-finger1"}
+def test_touching_names_the_kind(depth: float, x: float, y: float, names: set[str]) -> None:
+    """A square beside an upright link, or above its tip."""
+    scene = make_scene(base=0.08, depth=depth, length=0.12)
+    touching = find_touching(scene, np.array([x, y, 0.0, np.pi / 2, np.pi / 2]))
+    assert {contact.name for contact in touching if contact.finger == 0} == names
 
 
 @pytest.mark.parametrize("base", [[0.0, 0.03], [0.0, -0.004], [0.029, 0.03], [0.034, 0.03]])
@@ -205,10 +195,7 @@ def test_flush_edge_lies_on_the_palm(seed: int) -> None:
         assert heights.min() > -ROUNDING
 
 
-ROLLING = ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v2-tip2"]
-
-
-@pytest.mark.parametrize("name", ROLLING)
+@each("name", ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v2-tip2"])
 def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     scene = make_scene(SQUARE)
     sliding = make_formation(scene, f"v1-palm {name} v0-finger2")
@@ -216,9 +203,8 @@ def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     assert (formation.n_contacts, formation.n_rolling, formation.n_constraints) == (3, 1, 4)
     assert formation.rolling_rows == (1,) and formation.contacts == sliding.contacts
     assert formation.sliding_friction == pytest.approx([0.1, 0.0, 0.1])
-    rng = np.random.default_rng(8)
-    z, v = rng.uniform([-0.1, 0.02, -3, 0.3, 0.3], [0.1, 0.15, 3, 2.8, 2.8], (9, 5)), 1e-6
-    speed = rng.uniform(-1, 1, z.shape)
+    z, v = configurations(8), 1e-6
+    speed = np.random.default_rng(8).uniform(-1, 1, z.shape)
     here = formation.evaluate(z, speed)
     np.testing.assert_array_equal(here.P, np.concatenate([here.A, here.A_t[:, 1:2]], axis=1))
     ahead, behind = (formation.evaluate(z + step * speed, speed).P for step in (v, -v))
@@ -230,14 +216,6 @@ def test_only_contacts_roll() -> None:
     contacts = make_formation(make_scene(SQUARE), "v0-palm v1-palm v2-palm").contacts
     with pytest.raises(ValueError, match="v2-palm roll, which are no contacts"):
         Formation(make_scene(SQUARE), contacts[:2], contacts[1:])
-
-
-def limits_at(scene: Scene, names: str, z: Array) -> dict[str, float]:
-    formation = make_formation(scene, names)
-    values = formation.evaluate_limits(z[None])[0]
-    texts = [limit.text for limit in formation.limits]
-    assert len(set(texts)) == len(texts)
-    return dict(zip(texts, values, strict=True))
 
 
 UPRIGHT = np.pi / 2
@@ -273,7 +251,11 @@ LEFT = np.array([-0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 )
 def test_limits_are_clearances(scene: Scene, names: str, z: Array, text: str, clear: float) -> None:
     """The square stands on the palm beside an upright link."""
-    assert limits_at(scene, names, z)[text] == pytest.approx(clear, abs=ROUNDING)
+    formation = make_formation(scene, names)
+    texts = [limit.text for limit in formation.limits]
+    assert len(set(texts)) == len(texts)
+    limit = formation.evaluate_limits(z[None])[0, texts.index(text)]
+    assert limit == pytest.approx(clear, abs=ROUNDING)
 
 
 @each(
@@ -348,12 +330,8 @@ def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     labels = label_cells(scene, x, phi)[:, [0, 2, 4]]
     usable = (labels >= 0).all(axis=1)
     assert usable.sum() > COUNT / 4
-    return (
-        scene,
-        labels[usable],
-        np.column_stack([x, phi])[usable],
-        close_fingers(scene, x[usable], phi[usable]).z,
-    )
+    labels, x, phi = labels[usable], x[usable], phi[usable]
+    return scene, labels, np.column_stack([x, phi]), close_fingers(scene, x, phi).z
 
 
 @pytest.mark.parametrize(("radius", "kinds"), [(0.01, {0, 1, 2}), (0.0, {0, 1})])

@@ -50,14 +50,9 @@ def stationary(heptagon: Problem) -> Curve:
     """A flip during which joint 1 stops and turns back: P_AI is singular there."""
     scene = make_scene(np.asarray(heptagon.scene.polygon.points), base=0.12, length=0.25)
     scene = replace(scene, fingers_collide=False)
-    problem = make_problem(
-        scene,
-        1,
-        -0.02,
-        ("v1-palm v2-palm v4-finger1 v6-finger2", "v0-finger2"),
-        ("v1-palm v4-finger1 v0-finger2 v6-finger2", "v3-finger1"),
-    )
-    return trace_phases(problem)[1]
+    slide = "v1-palm v2-palm v4-finger1 v6-finger2", "v0-finger2"
+    flip = "v1-palm v4-finger1 v0-finger2 v6-finger2", "v3-finger1"
+    return trace_phases(make_problem(scene, 1, -0.02, slide, flip))[1]
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +128,8 @@ def test_curve_equals_an_integration_of_its_tangent(every_curve: tuple[Curve, ..
         def slope(_: float, z: Array, curve: Curve = curve, sign: float = sign) -> Array:
             return np.asarray(sign * unit_tangent(curve.formation, z))
 
-        reference = solve_ivp(
-            slope, (0, curve.length), curve.start, "DOP853", t_eval=s, rtol=1e-13, atol=1e-15
-        )
+        span, accuracy = (0, curve.length), {"rtol": 1e-13, "atol": 1e-15}
+        reference = solve_ivp(slope, span, curve.start, "DOP853", t_eval=s, **accuracy)
         np.testing.assert_allclose(curve.evaluate(s).z, reference.y.T, rtol=0, atol=1e-10)
 
 
@@ -146,10 +140,9 @@ def test_tangent_and_curvature_are_derivatives(every_curve: tuple[Curve, ...]) -
         before, here, after = (curve.evaluate(s + k * h) for k in (-1, 0, 1))
         scale = 1 / curve.formation.scene.polygon.gyration_radius
         # Rounding 1e-16 over h, and h^2 times third derivatives, which grow like scale^3.
-        np.testing.assert_allclose((after.z - before.z) / (2 * h), here.z_s, atol=1e-7 * scale)
-        np.testing.assert_allclose(
-            (after.z_s - before.z_s) / (2 * h), here.z_ss, atol=1e-6 * scale**2
-        )
+        slope, bend = (after.z - before.z) / (2 * h), (after.z_s - before.z_s) / (2 * h)
+        np.testing.assert_allclose(slope, here.z_s, atol=1e-7 * scale)
+        np.testing.assert_allclose(bend, here.z_ss, atol=1e-6 * scale**2)
         along = (here.z_s * here.z_ss) @ metric_weights(curve.formation.scene)
         assert np.abs(along).max() < 1e-12
 
@@ -211,14 +204,13 @@ def check_clear(curve: Curve) -> None:
         assert finger_gap(scene, z[:, :3], finger, z[:, 3 + finger]).min() > -1e-11
 
 
-def side_reach(length: float) -> float:
-    """How far left of the joint a corner 0.07 m above it is when it comes to the tip."""
-    return float(np.sqrt(length**2 + 0.005**2 - 0.07**2))
+SIDE_REACH = float(np.sqrt(0.1**2 + 0.005**2 - 0.07**2))
+"""How far left of its joint a corner 0.07 m above it is when it comes to the tip of 0.1 m."""
 
 
-def tip_reach(length: float, height: float) -> float:
-    """How far left of the joint the tip is when it is so high above it."""
-    return float(np.sqrt(length**2 - height**2))
+def tip_place(height: float) -> float:
+    """X of a square which a link of 0.075 m touches with its tip, so high above its joint."""
+    return float(0.045 - np.sqrt(0.075**2 - height**2))
 
 
 LEFT_V3 = "v0-palm v1-palm v3-finger2"
@@ -228,14 +220,12 @@ LEFT_V3 = "v0-palm v1-palm v3-finger2"
     "length, contact, goal, text, x",
     [
         # Corner 2 at (x + 0.03, 0.06); the joint at (0.08, -0.01).
-        (0.1, "v2-finger1", -0.05, "v2 runs off finger 1 at its tip", 0.05 - side_reach(0.1)),
+        (0.1, "v2-finger1", -0.05, "v2 runs off finger 1 at its tip", 0.05 - SIDE_REACH),
         (0.2, "v2-finger1", 0.09, "v1 touches finger 1", 0.045),
-        (0.075, "e1-tip1", 0.05, "the tip of finger 1 runs off edge 1 at v2",
-         0.045 - tip_reach(0.075, 0.07)),
-        (0.075, "e1-tip1", -0.05, "the tip of finger 1 runs off edge 1 at v1",
-         0.045 - tip_reach(0.075, 0.01)),
+        (0.075, "e1-tip1", 0.05, "the tip of finger 1 runs off edge 1 at v2", tip_place(0.07)),
+        (0.075, "e1-tip1", -0.05, "the tip of finger 1 runs off edge 1 at v1", tip_place(0.01)),
     ],
-)  # fmt: skip
+)
 def test_early_ending_says_what_and_where(
     length: float, contact: str, goal: float, text: str, x: float
 ) -> None:
@@ -248,11 +238,9 @@ def test_early_ending_says_what_and_where(
     assert f"x = {goal:g} m is never reached" in caught.value.problem
     assert f"{text} at x = {1e3 * x:.4g} mm, phi = " in caught.value.problem
 
-    formation = problem.phases[0].formation
-    ends = [
-        trace_curve(formation, problem.start, h, NEVER) for h in headings(formation, problem.start)
-    ]
-    (curve,) = [c for c in ends if (c.end[0] - problem.start[0]) * goal > 0]
+    formation, z = problem.phases[0].formation, problem.start
+    ends = [trace_curve(formation, z, heading, NEVER) for heading in headings(formation, z)]
+    (curve,) = [own for own in ends if (own.end[0] - z[0]) * goal > 0]
     assert not curve.reached and curve.ending.startswith(text)
     assert curve.end[0] == pytest.approx(x, abs=1e-12)
 
@@ -285,7 +273,7 @@ def test_random_hands_give_valid_curves(seed: int) -> None:
     rng = np.random.default_rng(seed)
     traced = 0
     for _ in range(6):
-        lengths = (float(rng.uniform(0.06, 0.25)), float(rng.uniform(0.06, 0.25)))
+        lengths = rng.uniform(0.06, 0.25), rng.uniform(0.06, 0.25)
         points = convex_polygon(rng, int(rng.integers(3, 8)))
         radius = float(rng.choice([0.0, 0.004, 0.012]))
         scene = make_scene(points, lengths=lengths, radius=radius, base=0.11, depth=-0.015)
@@ -373,17 +361,14 @@ def released(outlines: list[list[PathGuess]]) -> Array:
     return np.asarray(outlines[-1][0].z[0])
 
 
-def test_outlines_are_closed_at_every_point(outlines: list[list[PathGuess]]) -> None:
-    for part in (part for phase in outlines for part in phase):
-        assert len(part.z) == POINTS
-        assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
-        assert part.formation.evaluate_limits(part.z).min() > -CLOSED
-
-
-def test_outlines_end_where_their_phase_does(
+def test_outlines_are_closed_at_every_point_and_end_where_their_phase_does(
     flipping: Problem, outlines: list[list[PathGuess]]
 ) -> None:
     for phase, parts in zip(flipping.phases, outlines, strict=True):
+        for part in parts:
+            assert len(part.z) == POINTS
+            assert np.abs(measure_gaps(part.formation, part.z)).max() < CLOSED
+            assert part.formation.evaluate_limits(part.z).min() > -CLOSED
         if not phase.until.is_release:
             end = parts[-1].z[-1:]
             assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 from rows import each
 from scenes import tipped
@@ -87,10 +86,8 @@ def test_assemble_lays_phases_end_to_end(trajectory: Trajectory) -> None:
     np.testing.assert_allclose(trajectory.phase_starts, [0.0, 0.7, 0.9])
     assert trajectory.duration == pytest.approx(0.9)
     second = MOTIONS[1].evaluate(np.linspace(0, 0.2, 9))
-    np.testing.assert_array_equal(trajectory.z[9:], second.z)
-    np.testing.assert_array_equal(trajectory.z_dot[9:], second.z_dot)
-    np.testing.assert_array_equal(trajectory.z_ddot[9:], second.z_ddot)
-    np.testing.assert_array_equal(trajectory.tau[9:], second.tau)
+    for name in ("z", "z_dot", "z_ddot", "tau"):
+        np.testing.assert_array_equal(getattr(trajectory, name)[9:], getattr(second, name))
     np.testing.assert_array_equal(trajectory.c_n[9:, [1, 3, 2]], second.c_n)
     np.testing.assert_array_equal(trajectory.c_t[9:, [1, 3, 2]], second.c_t)
     assert np.isnan(trajectory.c_n[9:, 0]).all() and np.isnan(trajectory.c_t[:9, 3]).all()
@@ -143,17 +140,16 @@ def test_loaded_motions_reproduce_quintics(trajectory: Trajectory, tmp_path: Pat
         t = np.linspace(0, known.duration, 101)
         found, wanted = motion.evaluate(t), known.evaluate(t)
         # Second derivatives divide rounding by the square of the step, 1/40 s.
-        for value, exact, error in zip(
-            found[:4], wanted[:4], (1e-14, 1e-12, 1e-10, 1e-14), strict=True
-        ):
+        errors = (1e-14, 1e-12, 1e-10, 1e-14)
+        for value, exact, error in zip(found[:4], wanted[:4], errors, strict=True):
             np.testing.assert_allclose(value, exact, atol=error)
         order = [known.contacts.index(name) for name in motion.contacts]
         np.testing.assert_allclose(found.c_n, wanted.c_n[:, order], atol=1e-13)
         np.testing.assert_allclose(found.c_t, wanted.c_t[:, order], atol=1e-13)
 
 
-def changed(arrays: dict[str, Any], name: str, change: str) -> Any:
-    value = np.array(arrays[name])
+def changed(array: Any, change: str) -> Any:
+    value = np.array(array)
     if change == "0-d":
         return np.array(1.0)
     if change == "short":
@@ -167,16 +163,6 @@ def changed(arrays: dict[str, Any], name: str, change: str) -> Any:
     return value
 
 
-@each("name", [*ARRAYS, "phase", *TEXT, *TORQUE])
-def test_missing_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str) -> None:
-    arrays = read_arrays(trajectory)
-    del arrays[name]
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(InputError, match="array is missing") as caught:
-        load_trajectory(tmp_path / "a.npz")
-    assert (caught.value.source, caught.value.key) == (str(tmp_path / "a.npz"), name)
-
-
 @each(
     "name, change",
     [(name, change) for name in [*ARRAYS, "phase"] for change in ("0-d", "inf", "text")]
@@ -184,14 +170,19 @@ def test_missing_array_is_named(trajectory: Trajectory, tmp_path: Path, name: st
     + [(name, "short") for name in [*ARRAYS[1:], "phase", "torque_coefficients"]]
     + [(name, "wide") for name in ARRAYS[1:]]
     + [(name, change) for name in TORQUE for change in ("0-d", "nan", "text")]
-    + [("contacts", "0-d")],
+    + [("contacts", "0-d")]
+    + [(name, "missing") for name in [*ARRAYS, "phase", *TEXT, *TORQUE]],
 )
 def test_bad_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str, change: str) -> None:
     arrays = read_arrays(trajectory)
-    arrays[name] = changed(arrays, name, change)
+    array = arrays.pop(name)
+    if change != "missing":
+        arrays[name] = changed(array, change)
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(InputError) as caught:
         load_trajectory(tmp_path / "a.npz")
+    assert caught.value.source == str(tmp_path / "a.npz")
+    assert ("array is missing" in caught.value.problem) == (change == "missing")
     # A wrong length of t or of contacts shows in what depends on it.
     loose = {"t": {"t", "q"}, "contacts": {"contacts", "c_n"}}
     assert caught.value.key in loose.get(name, {name})
@@ -260,23 +251,18 @@ def test_rolling_contacts_are_known_and_their_friction_is_interpolated(tmp_path:
     np.testing.assert_allclose(interpolated, exact, atol=0.02)
 
 
-BAD_META: dict[str, tuple[str, list[Any]]] = {
-    "rolling": ("not a list of names", [3, "v1-palm", ["v1-palm"], {"1": []}]),
-    "modes": (
-        "not a list of spans",
-        [3, [True], [[0.5]], [["a"]], [[{"start": 0.0, "stop": 1.0}]]],
-    ),
-}
-
-
-@pytest.mark.parametrize("key", BAD_META)
+@each(
+    "key, text, values",
+    [
+        ("rolling", "not a list of names", [3, "v1-palm", ["v1-palm"], {"1": []}]),
+        ("modes", "of spans", [3, [True], [[0.5]], [["a"]], [[{"start": 0.0, "stop": 1.0}]]]),
+    ],
+)
 def test_bad_names_of_rolling_contacts_and_modes(
-    trajectory: Trajectory, tmp_path: Path, key: str
+    trajectory: Trajectory, tmp_path: Path, key: str, text: str, values: list[Any]
 ) -> None:
-    text, values = BAD_META[key]
-    for given in values:
-        changed = replace(trajectory, meta={**trajectory.meta, key: given})
-        changed.save(tmp_path / "plan.npz")
+    for value in values:
+        replace(trajectory, meta={**trajectory.meta, key: value}).save(tmp_path / "plan.npz")
         with pytest.raises(InputError, match=text) as caught:
             load_trajectory(tmp_path / "plan.npz")
         assert caught.value.key == f"meta.{key}"
@@ -290,20 +276,14 @@ def write(path: Path, text: str) -> str:
     return str(path)
 
 
-def at(profile: TorqueProfile, t: ArrayLike) -> list[list[float]]:
-    values: list[list[float]] = profile.at(np.asarray(t, dtype=float)).tolist()
-    return values
-
-
 def test_linear_rows_with_a_step(tmp_path: Path) -> None:
     profile = read_torque_csv(write(tmp_path / "a.csv", GOOD))
     assert profile.breaks.tolist() == [0.0, 0.5, 2.0]
     assert profile.duration == 2.0
-    assert at(profile, [0.0, 0.25]) == [[1.0, -1.0], [1.5, -1.5]]
     # Just before the step and at it, where the later row holds.
     np.testing.assert_allclose(profile.at(np.array([0.5 - 1e-12])), [[2, -2]], atol=1e-10)
-    assert at(profile, [0.5]) == [[4.0, 0.0]]
-    assert at(profile, [1.25, 2.0]) == [[2.5, 1.5], [1.0, 3.0]]
+    tau = profile.at(np.array([0.0, 0.25, 0.5, 1.25, 2.0]))
+    assert tau.tolist() == [[1.0, -1.0], [1.5, -1.5], [4.0, 0.0], [2.5, 1.5], [1.0, 3.0]]
 
 
 @each(
