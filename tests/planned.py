@@ -16,11 +16,11 @@ from wholearm import End, Phase, Problem, TorqueProfile, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse
 from wholearm.results.dwell_record import assemble
-from wholearm.results.trajectory import Motion, Samples, Trajectory
+from wholearm.results.trajectory import Samples, Trajectory
 
 
 def forward(
@@ -71,29 +71,15 @@ class CosineMotion:
         s, v, a = self.law(t)
         point = self.curve.evaluate(s)
         owner = np.clip(np.searchsorted(self.turns, t, side="right") - 1, 0, len(self.turns) - 2)
-        tau, c_n = np.empty((len(t), 2)), np.empty((len(t), 4))
-        Xi = np.empty((len(t), 4))
-        for k, segment in enumerate(self.curve.segments):
-            mine = owner == k
-            if not mine.any():
-                continue
-            directions = Directions(segment.Xi, segment.sigma)
-            forces = inverse(
-                self.curve.formation, point.z[mine], point.z_s[mine], point.z_ss[mine], directions
-            )
-            # The sense of the null vector is that of the curve; here a squeeze always presses.
-            sense = np.where(forces.of_c[..., LAMBDA].sum(axis=1) < 0, -1.0, 1.0)
-            squeeze = sense * self.squeeze * (1 - self.fade * t[mine] / self.duration)
-            c_n[mine] = forces.c(a[mine], v[mine] ** 2, squeeze)
-            tau[mine] = forces.tau(a[mine], v[mine] ** 2, squeeze)
-            Xi[mine] = segment.Xi
+        formation, directions = self.curve.formation, directions_of(self.curve, owner)
+        forces = inverse(formation, *point[:3], directions)
+        # The sense of the null vector is that of the curve; here a squeeze always presses.
+        sense = np.where(forces.of_c[..., LAMBDA].sum(axis=1) < 0, -1.0, 1.0)
+        squeeze = sense * self.squeeze * (1 - self.fade * t / self.duration)
+        c_n, tau = forces.c(a, v**2, squeeze), forces.tau(a, v**2, squeeze)
         z_dot = point.z_s * v[:, None]
         z_ddot = point.z_s * a[:, None] + point.z_ss * (v**2)[:, None]
-        return Samples(point.z, z_dot, z_ddot, tau, c_n, -self.curve.formation.friction * Xi * c_n)
-
-    def fit(self, pieces: int, degree: int) -> TorqueProfile:
-        """The torques as polynomials, broken where a sliding direction reverses."""
-        return fit(self, self.turns, pieces, degree)
+        return Samples(point.z, z_dot, z_ddot, tau, c_n, -formation.friction * directions.Xi * c_n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,10 +192,6 @@ class LandingMotion:
         c_n, tau = np.asarray(solution[:, :3]), np.asarray(solution[:, 3:])
         return Samples(z, z_dot, z_ddot, tau, c_n, np.asarray(-slip * c_n))
 
-    def fit(self, pieces: int, degree: int) -> TorqueProfile:
-        """The torques as polynomials, broken where a direction reverses."""
-        return fit(self, self.turns, pieces, degree)
-
 
 def hermite(p: float, p_dot: float, q: float, q_dot: float, duration: float, t: Array) -> Array:
     """The cubic from p to q with the given slopes, and two derivatives, shape (3, n)."""
@@ -221,8 +203,11 @@ def hermite(p: float, p_dot: float, q: float, q_dot: float, duration: float, t: 
     return np.array([value, first, (2 * c + 6 * d * u) / duration**2])
 
 
-def fit(motion: Motion, turns: Array, pieces: int, degree: int) -> TorqueProfile:
-    """The torques of a motion as polynomials, broken at `turns`."""
+def fit(
+    motion: CosineMotion | LandingMotion, pieces: int, degree: int, turns: Array | None = None
+) -> TorqueProfile:
+    """The torques of a motion as polynomials, broken at `turns`: where a direction reverses."""
+    turns = motion.turns if turns is None else turns
     counts = np.maximum(1, np.ceil(pieces * np.diff(turns) / motion.duration)).astype(int)
     grids = [
         np.linspace(*ends, n + 1)[:-1] for ends, n in zip(pairwise(turns), counts, strict=True)
@@ -253,7 +238,7 @@ def plan(
         CosineMotion(curve, duration, choose_squeeze(curve, duration, least, 2.0))
         for curve in trace_phases(problem)
     ]
-    torque = TorqueProfile.chain([motion.fit(pieces, degree) for motion in motions])
+    torque = TorqueProfile.chain([fit(motion, pieces, degree) for motion in motions])
     return problem, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
 
 
@@ -279,7 +264,7 @@ def plan_landing(duration: float = 0.2, squeeze: float = 12.0) -> tuple[Problem,
         Phase(1, formation, Until(contact=parse_contact("v2-palm", scene))),
     )
     motions: tuple[DepartingMotion, LandingMotion] = (departing, landing)
-    torque = TorqueProfile.chain([motion.fit(60, 7) for motion in motions])
+    torque = TorqueProfile.chain([fit(motion, 60, 7) for motion in motions])
     one = dataclasses.replace(problem, start=curve.start, phases=phases)
     return one, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
 

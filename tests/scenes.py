@@ -51,25 +51,18 @@ def make_way(solid: bool) -> Problem:
     return problem_of(HEXAGON).with_(changes | {"fingers_collide": solid})
 
 
-def place_links(scene: Scene, z: Array) -> list[Array]:
-    """Ends of both segments at n configurations, shape (n, 2, 2) each [m]."""
-    ends = []
+def measure_fingers(scene: Scene, z: Array) -> Array:
+    """Gap between the links, shape (n,) [m]; negative: minus the least push that parts them."""
+    segments = []
     for link, angle in zip(scene.fingers, z[:, 3:].T, strict=True):
         base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
         tip = base + link.length * np.column_stack([np.cos(angle), np.sin(angle)])
-        ends.append(np.stack([base, tip], axis=1))
-    return ends
+        segments.append(np.stack([base, tip], axis=1))
+    return separate(*segments) - sum(link.radius for link in scene.fingers)
 
 
-def measure_fingers(scene: Scene, z: Array) -> Array:
-    """Gap between the links, shape (n,) [m]; negative: minus the least push that parts them."""
-    return separate(*place_links(scene, z)) - sum(link.radius for link in scene.fingers)
-
-
-HALF = 0.03
-"""Half a side of the square [m]."""
-LEVER = HALF * np.sqrt(2.0)
-"""From its centroid to a vertex [m]."""
+LEVER = 0.03 * np.sqrt(2.0)
+"""From the centroid of the square to a vertex [m]."""
 
 
 @cache
@@ -117,10 +110,9 @@ def raised(stop: float = 0.5) -> Problem:
 
     The vertex slides without friction, so that either finger may go either way.
     """
-    scene = _with_palm(0.02, 0.0)
-    start = _close(scene, _tip(scene, 0.3), 0.0)
-    phase = Phase(0, Formation(scene, find_touching(scene, start)), Until(None, "phi", stop))
-    return Problem("raise", scene, 0.05, start, (phase,))
+    problem, _ = lift()
+    phase = Phase(0, problem.phases[0].formation, Until(None, "phi", stop))
+    return replace(problem, name="raise", phases=(phase,))
 
 
 def _with_palm(fingers: float, palm: float) -> Scene:
@@ -159,14 +151,11 @@ def _rising_time(start: float, stop: float, rolls: bool) -> float:
     assert body.inertia is not None
     inertia, mass = body.inertia, body.mass
 
-    def height(phi: float) -> float:
-        return float(LEVER * np.sin(phi + np.pi / 4))
-
     def slowness(s: float) -> float:
         # phi = stop - s^2 takes away the singularity at the end.
-        phi = stop - s * s
-        share = 1.0 if rolls else np.cos(phi + np.pi / 4) ** 2
-        rise = mass * 9.81 * (height(stop) - height(phi))
+        angle, end = stop - s * s + np.pi / 4, stop + np.pi / 4
+        share = 1.0 if rolls else np.cos(angle) ** 2
+        rise = mass * 9.81 * LEVER * (np.sin(end) - np.sin(angle))
         return float(2 * s * np.sqrt((inertia + mass * LEVER**2 * share) / (2 * rise)))
 
     return float(quad(slowness, 0.0, np.sqrt(stop - start))[0])

@@ -133,10 +133,13 @@ def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture
         assert "--output DIR" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("option", ["--scenes", "--files", "--seed", "--jobs", "--only"])
-def test_numbers_out_of_range_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "stress", option, "-1"]) == 2
-    assert capsys.readouterr().err.startswith(f"wholearm: {option}: -1 given")
+def test_options_out_of_range_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for option in ("--scenes", "--files", "--seed", "--jobs", "--only"):
+        assert main(["bench", "stress", option, "-1"]) == 2
+        assert capsys.readouterr().err.startswith(f"wholearm: {option}: -1 given")
+    command = ["bench", "precision", "--problems", str(FOLDER), "-o", "out"]
+    assert main([*command, "--peers", "fastest"]) == 2
+    assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
 
 
 def test_a_process_that_hangs_or_dies_is_replaced() -> None:
@@ -311,16 +314,13 @@ def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
     assert int(cells[5]) > int(cells[4])
 
 
-NODES, CONTACTS = 60, 4
-"""Five nodes for each of twelve elements; sliding contacts."""
-
-
 def test_counts_of_one_phase_are_those_of_theory() -> None:
+    nodes, contacts = 60, 4  # five nodes for each of twelve elements; sliding contacts
     found = count(build_problem(tomllib.loads(text_of())))
     # Speed, acceleration and squeeze at each node, but for the speed at both ends, where it is 0.
-    assert found["phase 1 of 1: unknowns"] == 3 * NODES - 2
+    assert found["phase 1 of 1: unknowns"] == 3 * nodes - 2
     # How the speed goes on, and the forces and torques at each node.
-    assert found["phase 1 of 1: rows"] == NODES - 1 + (CONTACTS + 2) * NODES
+    assert found["phase 1 of 1: rows"] == nodes - 1 + (contacts + 2) * nodes
     assert found["panels of curves"] >= 1 and set(BANDS) < set(found)
     assert found["iterations"] > 1 and found["evaluations of the replay"] > 12
 
@@ -530,12 +530,6 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     _, violation, outcome = check_plan(phase(4), plan._replace(torque=zero))
     assert "contact is lost" in outcome and violation > 0.02
     assert check_plan(phase(4), plan._replace(status="stopped"))[2] == "stopped"
-
-
-def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "precision", "--problems", str(FOLDER), "-o", "out"]
-    assert main([*command, "--peers", "fastest"]) == 2
-    assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
 
 
 @lru_cache

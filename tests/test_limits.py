@@ -480,13 +480,11 @@ def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) 
     least = bound_least_time([curves[0]], EPSILON)
     assert least is not None
     allowed = 1.5 * least.value
-    options = PlanOptions(objective=Objective.MARGIN)
-    plan = plan_path(curves[0], EPSILON, options, 1, allowed)
+    plan = plan_path(curves[0], EPSILON, PlanOptions(Objective.MARGIN), 1, allowed)
     assert plan.value > EPSILON
     # With that margin no motion is faster.
     bound = bound_least_time([curves[0]], plan.value)
-    assert bound is not None
-    assert bound.value == pytest.approx(allowed, rel=1e-3)
+    assert bound is not None and bound.value == pytest.approx(allowed, rel=1e-3)
 
 
 def test_a_margin_that_a_place_limits_does_not_grow_with_the_duration(

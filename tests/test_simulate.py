@@ -38,7 +38,6 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
-from wholearm.scene.model import Friction
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.modes import Collapse, find_rest
@@ -52,11 +51,6 @@ def pick(index: int) -> tuple[Problem, CosineMotion]:
     motion = trajectory.motions[index]
     assert isinstance(motion, CosineMotion)
     return part_of(problem, index, index + 1), motion
-
-
-def with_friction(problem: Problem, *friction: float) -> Problem:
-    scene = dataclasses.replace(problem.scene, friction=Friction(*friction))
-    return dataclasses.replace(problem, scene=scene)
 
 
 def test_imports_nothing_of_the_planner() -> None:
@@ -99,7 +93,7 @@ def test_follows_the_plan() -> None:
 @pytest.mark.parametrize("index", [0, 2, 4])
 def test_finds_the_reversals_of_the_curve(index: int) -> None:
     problem, motion = pick(index)
-    simulation = simulate(problem, motion.fit(40, 7))
+    simulation = simulate(problem, fit(motion, 40, 7))
     reversals = simulation.find(EventKind.REVERSAL)
     assert [e.time for e in reversals] == pytest.approx(list(motion.turns[1:-1]), abs=1e-9)
 
@@ -125,7 +119,7 @@ def test_a_reversal_next_to_a_stop_turns_all_that_slides() -> None:
 @pytest.mark.parametrize("late", [-4e-7, 4e-7])
 def test_a_torque_step_belongs_to_its_reversal(late: float) -> None:
     problem, motion = pick(0)
-    exact = motion.fit(40, 7)
+    exact = fit(motion, 40, 7)
     turn = motion.turns[1]
     moved = np.where(np.abs(exact.breaks - turn) < 1e-12, turn + late, exact.breaks)
     torque = TorqueProfile(moved, exact.coefficients)
@@ -145,7 +139,7 @@ def test_a_torque_step_belongs_to_its_reversal(late: float) -> None:
 
 def test_error_follows_tolerance() -> None:
     problem, motion = pick(1)
-    torque = motion.fit(1, 24)
+    torque = fit(motion, 1, 24)
     times = np.array([0.15, 0.3, 0.37])
     reference = simulate(problem, torque, tolerance=1e-13, times=times)
     errors = []
@@ -204,7 +198,7 @@ def test_balance_is_lost_where_no_forces_are_left(bend: float) -> None:
 
 def test_torque_steps_are_recorded_twice() -> None:
     problem, motion = pick(1)
-    torque = motion.fit(40, 7)
+    torque = fit(motion, 40, 7)
 
     def kick(starts: Array, c: Array) -> Array:
         c[starts >= 0.2 - 1e-12, :, 0] += [0.01, -0.01]
@@ -225,7 +219,7 @@ def test_torque_steps_are_recorded_twice() -> None:
 def test_contact_is_lost_when_the_squeeze_fades() -> None:
     problem, motion = pick(1)
     fading = dataclasses.replace(motion, fade=1.0)
-    torque = fading.fit(40, 7)
+    torque = fit(fading, 40, 7)
     simulation = simulate(problem, torque, tolerance=1e-11)
     assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
     event = simulation.events[-1]
@@ -297,9 +291,9 @@ def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
 def test_jamming_is_an_error_that_names_phase_and_time() -> None:
     problem, motion = pick(2)
     # On this much friction the phase starts, and jams on the way.
-    rough = with_friction(problem, 0.4, 0.1, 2.0)
+    rough = problem.with_(friction_palm=0.4, friction_finger2=2.0)
     curve = dataclasses.replace(motion.curve, formation=rough.phases[0].formation)
-    torque = CosineMotion(curve, motion.duration, 0.3).fit(40, 7)
+    torque = fit(CosineMotion(curve, motion.duration, 0.3), 40, 7)
     place = r"v6-finger2 jams at t = 0\.1\d+ s, phase 1: friction"
     with pytest.raises(JammingError, match=place) as caught:
         simulate(rough, torque)
@@ -308,7 +302,7 @@ def test_jamming_is_an_error_that_names_phase_and_time() -> None:
 
 def test_a_jammed_formation_at_rest() -> None:
     problem, motion = pick(1)
-    rough = with_friction(problem, 1.5, 1.5, 1.5)
+    rough = problem.with_(friction=1.5)
     rest = find_rest(rough.phases[0].formation, rough.start)
     assert max(way.response.ratio for way in rest.sliding) < 0
     simulation = simulate(rough, constant((0.0, 0.0)))
@@ -393,7 +387,7 @@ def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
     )
     t = np.linspace(0.0, duration, 101)
     motion = next(motion for motion in tries if motion.evaluate(t).c_n.min() > 0.1)
-    torque = motion.fit(60, 7)
+    torque = fit(motion, 60, 7)
     after = TorqueProfile(np.array([0.0, 0.01]), np.array([[[1.0], [-1.0]]]))
     return problem, TorqueProfile.chain([torque, after]) if beyond else torque
 
@@ -452,7 +446,7 @@ def test_a_step_of_the_torques_just_before_a_planned_stop_is_not_its_end() -> No
     motion = CosineMotion(curve, 0.5, choose_squeeze(curve, 0.5, 0.2, 2.0))
     before = 0.5 * (1 - 2 / np.pi * np.sqrt(1e-5 * scales.length / curve.length))
     assert motion.law(np.array([before]))[0][0] > curve.length - 2e-5 * scales.length
-    torque = fit(motion, np.sort([*motion.turns, before]), 20, 7)
+    torque = fit(motion, 20, 7, np.sort([*motion.turns, before]))
     steps = torque.coefficients.copy()
     steps[torque.breaks[:-1] >= before, :, 0] += 1e-7 * scales.torque
     simulation = simulate(problem, TorqueProfile(torque.breaks, steps))

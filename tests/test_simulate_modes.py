@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from independent import balances, integrate_phase, march
 from once import once
 from plane import convex_polygon, make_formation, make_scene, measure_slip, place_corners
-from planned import CosineMotion, LandingMotion, change, choose_squeeze, forward, plan_landing
+from planned import CosineMotion, LandingMotion, change, choose_squeeze, fit, forward, plan_landing
 from pushing import Push, Roll, pushed, rocking
 from scenes import POINTS, box, constant, falling, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
@@ -425,8 +425,8 @@ RELEASE = 0.5
 """When `plan_landing` lets vertex 3 go [s]."""
 
 
-def landing_of(duration: float = 0.2) -> LandingMotion:
-    motion = plan_landing(duration)[1].motions[1]
+def landing_of() -> LandingMotion:
+    motion = plan_landing()[1].motions[1]
     assert isinstance(motion, LandingMotion)
     return motion
 
@@ -548,12 +548,16 @@ def test_a_release_that_never_comes() -> None:
     assert report.phases[0].arrival is None
 
 
-def test_start_with_two_freedoms() -> None:
+def landing_from_rest() -> Problem:
+    """The second half of the landing alone, from rest halfway."""
     problem, _ = plan_landing()
-    phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
-    z = landing_of().evaluate(np.array([0.1])).z[0]
-    rng = np.random.default_rng(3)
-    moving = replace(problem, start=z, phases=(phase,))
+    start = landing_of().evaluate(np.array([0.1])).z[0]
+    return replace(problem, start=start, phases=(replace(problem.phases[1], index=0),))
+
+
+def test_start_with_two_freedoms() -> None:
+    moving, rng = landing_from_rest(), np.random.default_rng(3)
+    (phase,), z = moving.phases, moving.start
     rest, seen = find_rest(phase.formation, z), 0
     assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
@@ -581,11 +585,8 @@ def test_start_with_two_freedoms() -> None:
 
 def test_start_with_a_contact_that_sticks() -> None:
     """Neither balance nor sliding everywhere; time stepping is not told what sticks."""
-    problem, _ = plan_landing()
-    phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
-    z = landing_of().evaluate(np.array([0.1])).z[0]
-    still = replace(problem, start=z, phases=(phase,))
-    tau = np.array([0.4, -0.4])
+    still, tau = landing_from_rest(), np.array([0.4, -0.4])
+    (phase,), z = still.phases, still.start
     simulation = simulate(still, constant(tau, 0.01))
     assert simulation.events[0].kind is EventKind.START
     row = np.flatnonzero(~np.isnan(simulation.c_n[:, 0]))[0]
@@ -641,7 +642,7 @@ def test_a_pointed_tip_gains_either_edge_at_a_vertex(until: str) -> None:
     assert np.hypot(*corner) == pytest.approx(0.057, rel=1e-9)
     motions = [CosineMotion(c, 0.4, choose_squeeze(c, 0.4, 0.2, 2.0)) for c in curves]
     simulation = simulate(
-        problem, TorqueProfile.chain([motion.fit(20, 7) for motion in motions]), times=[0.2]
+        problem, TorqueProfile.chain([fit(motion, 20, 7) for motion in motions]), times=[0.2]
     )
     assert simulation.outcome.reached
     halfway = motions[0].evaluate(np.array([0.2])).z[0]

@@ -309,10 +309,9 @@ def test_little_less_friction_takes_little_more_time() -> None:
     """The landing with friction 0.06 is that with 0.07, continued: no limit of it is far."""
     lasts = []
     for friction in (0.07, 0.06):
-        landing = problem_of(HEPTAGON).with_(friction=friction)
-        start = trace_phases(landing)[3].end
-        plans = plan_phases(landing, landing.phases[4:], start, PlanOptions(), only_begin=True)
-        lasts.append(sum(plan.motion.duration for plan in plans))
+        problem = part_of(problem_of(HEPTAGON).with_(friction=friction), 4)
+        given = problem, problem.phases, problem.start, PlanOptions()
+        lasts.append(total(plan_phases(*given, only_begin=True)))
     assert lasts[1] == pytest.approx(lasts[0], rel=0.03)
 
 
@@ -330,8 +329,7 @@ def test_the_value_of_a_margin_is_the_least_force() -> None:
     plans = plan_phases(problem, problem.phases, problem.start, options, allowed)
     # With more time it would be larger.
     assert total(plans) == pytest.approx(allowed, rel=1e-8)
-    samples = [stage.evaluate(instants(stage, 12)) for stage in stages_of(plans)]
-    least = min(part.c_n.min() for part in samples)
+    least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages_of(plans))
     # Forces keep to it between points too, where limits are tightened a little too much.
     assert plans[0].value < least + SLACK
     assert plans[0].value == pytest.approx(least, rel=2e-3)
@@ -621,8 +619,8 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     problem = tilting()
     (phase,) = problem.phases
     rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
-    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
-    plan = solve(problem, time_intervals=6, replay=False).trajectory
+    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False)
+    plan = solve(problem, time_intervals=6, replay=False)
     assert plan.duration < 0.95 * bound.duration
     assert verify(problem, plan).ok
 
@@ -678,8 +676,7 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
     problem = pin(landing(), 5, ("x", 0.0195))
     start = trace_phases(problem)[-1].end
     # All guesses: what a single one leads to depends on the last bits.
-    options = PlanOptions(time_intervals=4)
-    plans = plan_phases(problem, problem.phases[4:], start, options)
+    plans = plan_phases(problem, problem.phases[4:], start, PlanOptions(time_intervals=4))
     motion = plans[-1].motion
     end = motion.evaluate(np.array([motion.duration]))
     size, speed = problem.scene.scales.length, problem.scene.scales.speed

@@ -43,15 +43,15 @@ from wholearm.verification.verify import list_normal_forces, verify
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 
 
-def scene_of(mu: float = 0.3) -> Scene:
-    scene = make_scene(friction=mu)
+def scene_of() -> Scene:
+    scene = make_scene()
     right, left = (replace(link, viscous=0.02, dry=0.03) for link in scene.fingers)
-    return Scene(scene.polygon, (right, left), Friction(mu, 0.8 * mu, 0.6 * mu))
+    return replace(scene, fingers=(right, left), friction=Friction(0.3, 0.24, 0.18))
 
 
-def random_samples(formation: Formation, count: int = 30) -> Samples:
+def random_samples(formation: Formation) -> Samples:
     """States and forces that obey no equation, but friction that opposes the sliding."""
-    rng = np.random.default_rng(5)
+    rng, count = np.random.default_rng(5), 30
     z = rng.uniform(-1, 1, (count, 5)) * [0.05, 0.05, 1.0, 0.5, 0.5] + [0, 0.05, 0, 1.2, 1.9]
     v, a = rng.uniform(-1, 1, (count, 5)), rng.uniform(-5, 5, (count, 5))
     c_n = rng.uniform(0.1, 3.0, (count, formation.n_contacts))
@@ -425,8 +425,7 @@ def test_the_least_gap_of_the_fingers_is_reported() -> None:
     assert report.finger_gap.least == pytest.approx(gaps.min(), abs=1e-7) and gaps.min() > 1e-3
     when = np.concatenate([t for t, _ in instants])[gaps.argmin()]
     assert report.finger_gap.time == pytest.approx(when, abs=1e-3)
-    text = f"least gap of the fingers: {gaps.min():.4f}"
-    assert text in report.to_text()
+    assert f"least gap of the fingers: {gaps.min():.4f}" in report.to_text()
     values = json.loads(json.dumps(report.to_dict()))["finger_gap"]
     assert values == {"least": report.finger_gap.least, "time": report.finger_gap.time}
 
