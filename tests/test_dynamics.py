@@ -240,10 +240,8 @@ def test_each_body_takes_its_impulses_as_complementarity_says(
             np.testing.assert_array_equal(impact.v, join.impact.v)
             check_momenta(impact, z, v)
             # Every contact is kept afterwards, and one arrives before.
-            kept, arriving = (
-                measure_gaps(after, z + 1e-6 * u) - measure_gaps(after, z - 1e-6 * u)
-                for u in (impact.v, v)
-            )
+            steps = 1e-6 * np.array([impact.v, v])
+            kept, arriving = measure_gaps(after, z + steps) - measure_gaps(after, z - steps)
             assert np.abs(kept).max() < 1e-14 and arriving.min() < -1e-7
             # Moreau's law, which assumes neither what presses nor what slides which way.
             released = [c for c in before.contacts if c not in after.contacts]
@@ -304,9 +302,7 @@ def test_random_impacts_never_gain_energy() -> None:
 
 def drop(v: Array, friction: float, lean: float = 0.3) -> tuple[Impact, Array, Scene]:
     """Impact of corner 1 on the palm, and r; the square is turned by `lean`."""
-    scene = make_scene(SQUARE, friction=friction)
-    c, s = np.cos(lean), np.sin(lean)
-    r = np.array([0.03 * c + 0.03 * s, 0.03 * s - 0.03 * c])
+    scene, r = make_scene(friction=friction), rotate(lean, [0.03, -0.03])
     formation = make_formation(scene, "v1-palm")
     z = np.array([0.0, -r[1], lean, 0.5, 2.6])
     assert abs(measure_gaps(formation, z)[0]) < 1e-13
@@ -452,19 +448,11 @@ def test_ties_do_not_cycle() -> None:
 def draw(rng: np.random.Generator, mu: float) -> ContactProblem:
     """Three contacts, the first two of which may stick, and a joint, on five coordinates."""
     A, A_t = rng.normal(size=(2, 3, 5))
-    Xi = np.array([0.0, 0.0, rng.choice([-1.0, 1.0])])
-    T = np.vstack([A_t[:2], np.eye(5)[3]])
-    return ContactProblem(
-        rng.uniform(0.5, 2.0, 5),
-        A,
-        A - mu * Xi[:, None] * A_t,
-        rng.normal(size=3),
-        T,
-        rng.normal(size=3),
-        np.array([0, 1, -1]),
-        np.array([mu, mu, 0.0]),
-        np.array([0.0, 0.0, 0.3]),
-    )
+    G, T = A.copy(), np.vstack([A_t[:2], np.eye(5)[3]])
+    G[2] -= mu * rng.choice([-1.0, 1.0]) * A_t[2]
+    lift, (b_n, b_t) = rng.uniform(0.5, 2.0, 5), rng.normal(size=(2, 3))
+    bounds = np.array([mu, mu, 0.0]), np.array([0.0, 0.0, 0.3])
+    return ContactProblem(lift, A, G, b_n, T, b_t, np.array([0, 1, -1]), *bounds)
 
 
 def check(p: ContactProblem, answer: ContactAnswer) -> None:

@@ -566,13 +566,6 @@ def test_the_gap_is_a_limit_of_every_formation() -> None:
 FAR_GOAL = Goal(flush=0, x=9.0)  # that no border leads to
 
 
-def look(curve: Curve, epsilon: float) -> float:
-    try:
-        return look_along((curve,), epsilon, 100)
-    except NoMotionError:
-        return math.inf
-
-
 def make_border(curve: Curve) -> Border:
     z = curve.evaluate(np.linspace(0, curve.length, 12)).z
     still = np.zeros(len(z), dtype=bool)
@@ -586,10 +579,14 @@ def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
     for forth in curves:
         way = -forth.evaluate(np.array([forth.length])).z_s[0]
         back = cut_curve(trace_curve(forth.formation, forth.end, way, Until()), forth.length)
-        expected.append([look(own, problem.epsilon) for own in (forth, back)])
+        for own in (forth, back):
+            try:
+                expected.append(look_along((own,), problem.epsilon, 100))
+            except NoMotionError:
+                expected.append(math.inf)
     found = time_borders(problem, [make_border(curve) for curve in curves])
     # Twelve points and twenty-four intervals leave an error of a few in a hundred.
-    assert found == pytest.approx(np.array(expected), rel=0.04)
+    assert found.ravel() == pytest.approx(np.array(expected), rel=0.04)
     assert np.isfinite(found[:, 0]).all()
 
 
@@ -597,17 +594,15 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     problem = problem_of(IMPACTS)
     chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
     until = [str(phase.until) for phase in phases]
-    (own,) = (
-        edge
-        for edge in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
-        if [str(step.until) for step in edge.steps] == until
-    )
+    place = make_place(problem.scene, problem.start)
+    edges = chart.list_along(place, FAR_GOAL)
+    (own,) = (edge for edge in edges if [str(step.until) for step in edge.steps] == until)
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
     took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
     assert own.bound <= took * (1 + 1e-6)
     assert own.estimate == pytest.approx(took, rel=1e-2)
     # A stop at each crossing takes longer, by what the plan says that the impacts save.
-    alone, place = 0.0, make_place(problem.scene, problem.start)
+    alone = 0.0
     for phase in phases:
         (edge,) = (
             edge
@@ -639,8 +634,8 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
     for edge in landings:
         assert is_at(edge.stop, goal) and str(edge.steps[-1].until) == "v2-palm at x = 0.022 m"
         assert [step.end for step in edge.steps] == [End.SMOOTH, End.REST]
-        gaps = Formation(problem.scene, edge.stop.contacts).evaluate(*[edge.stop.z[None]] * 2).C
-        assert np.abs(gaps).max() < 1e-8 * problem.scene.scales.length
+        closed = gaps(problem.scene, edge.stop.contacts, edge.stop.z[None])
+        assert np.abs(closed).max() < 1e-8 * problem.scene.scales.length
     assert chart.land_at(chart.release(border, borders), Goal(flush=1)) == []
 
 
@@ -651,10 +646,8 @@ def test_parts_of_a_joined_curve_are_what_is_traced_from_there(
     """Joined of the two that are traced both ways from a place inside another one."""
     curve = curves[index]
     at = curve.evaluate(np.array([0.4 * curve.length]))
-    back, forth = (
-        trace_curve(curve.formation, at.z[0], sign * at.z_s[0], Until()) for sign in (-1, 1)
-    )
-    whole = join(back, forth)
+    ways = -at.z_s[0], at.z_s[0]
+    whole = join(*(trace_curve(curve.formation, at.z[0], way, Until()) for way in ways))
     length = whole.formation.scene.scales.length
     for share in (0.0, 0.3, 0.7, 1.0):
         s = share * whole.length
