@@ -47,8 +47,7 @@ class Collision(NamedTuple):
     v: Array  # (5,)
     rates: Array  # rates, slips (n_c,) [m/s]: how fast contacts part and slide
     slips: Array
-    normal: Array  # normal, tangential (n_c,) [N s]: impulses
-    tangential: Array
+    normal: Array  # (n_c,) [N s]: impulses
 
 
 def collide(formation: Formation, z: Array, v: Array) -> Collision:
@@ -63,7 +62,7 @@ def collide(formation: Formation, z: Array, v: Array) -> Collision:
     none = np.zeros(len(rows))
     p = _solve((rows / mass) @ rows.T, rows @ v, formation.friction, none[:2], none)
     after = v + rows.T @ p / mass
-    return Collision(after, N @ after, T @ after, *np.split(p[:-2], 2))
+    return Collision(after, N @ after, T @ after, p[: len(N)])
 
 
 def march(

@@ -95,15 +95,8 @@ def convex_polygon(rng: np.random.Generator, count: int, size: float = 0.05) -> 
 
 
 def make_finger(base: ArrayLike, length: float = 0.18, radius: float = 0.005) -> Finger:
-    return Finger(
-        base=np.asarray(base, dtype=float),
-        length=length,
-        radius=radius,
-        inertia=0.005,
-        viscous=0.01,
-        dry=0.01,
-        torque_limit=2.0,
-    )
+    inertia, viscous, dry, torque_limit = 0.005, 0.01, 0.01, 2.0
+    return Finger(base, length, radius, inertia, viscous, dry, torque_limit)
 
 
 def make_scene(

@@ -364,12 +364,6 @@ def touch(*contacts: Any) -> Callable[[Problem], Problem]:
     return alter(formation=replace(FIRST.formation, contacts=contacts))
 
 
-def thicken(own: Problem) -> Problem:
-    right, left = own.scene.fingers
-    fingers = replace(right, viscous=1e6), left
-    return rebuild(own, scene=replace(own.scene, fingers=fingers))
-
-
 @each("make, file",
     [
         (lambda own: rebuild(own, epsilon=-0.1), {"epsilon": -0.1}),
@@ -377,7 +371,8 @@ def thicken(own: Problem) -> Problem:
         (lambda own: rebuild(own, name=3), {"name": 3}),
         (lambda own: rebuild(own, scene=replace(
             own.scene, polygon=wholearm.Polygon(own.scene.polygon.points, 1e9))), {"mass": 1e9}),
-        (thicken, {"viscous1": 1e6}),
+        (lambda own: rebuild(own, scene=replace(own.scene, fingers=(
+            replace(own.scene.fingers[0], viscous=1e6), own.scene.fingers[1]))), {"viscous1": 1e6}),
         (alter(until=Until(coordinate="x", value=1e6)), {"phases[1].until": {"x": 1e6}}),
         (alter(until=Until(coordinate="phi", value=1e3)),
          {"phases[1].until": {"phi_deg": float(np.degrees(1e3))}}),

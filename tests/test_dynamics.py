@@ -212,15 +212,6 @@ def tipping() -> ImpactSequence:
     return chain_of(HEPTAGON)
 
 
-def arrivals(chain: ImpactSequence) -> list[tuple[Formation, Formation, Array, Array]]:
-    """Formations before and after every impact, configuration, and velocity before."""
-    found = []
-    for before, after in pairwise(chain.curves):
-        point = before.evaluate(np.array([before.length]))
-        found.append((before.formation, after.formation, after.start, point.z_s[0]))
-    return found
-
-
 def check_momenta(impact: Impact, z: Array, before: Array) -> None:
     """Momentum of each body changes by the impulses at its contact points."""
     formation = impact.formation
@@ -235,7 +226,9 @@ def test_each_body_takes_its_impulses_as_complementarity_says(
     rough: ImpactSequence, tipping: ImpactSequence
 ) -> None:
     for chain in (rough, tipping):
-        for join, (before, after, z, v) in zip(chain.impacts, arrivals(chain), strict=True):
+        for join, (one, other) in zip(chain.impacts, pairwise(chain.curves), strict=True):
+            z, v = other.start, one.evaluate(np.array([one.length])).z_s[0]
+            before, after = one.formation, other.formation
             impact = compute_impact(before, after, z, v)
             np.testing.assert_array_equal(impact.v, join.impact.v)
             check_momenta(impact, z, v)

@@ -416,16 +416,12 @@ def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory)
 
 
 def test_command_writes_the_figure(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    chart: FormationMap,
-    trajectory: Trajectory,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    trajectory.save("plan.npz")
+    plan_of(HEPTAGON).save("plan.npz")
     with monkeypatch.context() as patch:
-        patch.setattr("wholearm.build_map", lambda *_, **__: chart)
+        patch.setattr("wholearm.build_map", lambda *_, **__: chart())
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
         assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
         data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()

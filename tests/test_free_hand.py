@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from plane import finger_gap, make_scene, rotate
+from plane import finger_gap, make_finger, make_scene, rotate
 from planned import change, plan
 from rows import each
 from shipped import HEXAGON, text_of
@@ -24,7 +24,7 @@ from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
-from wholearm.scene.model import Finger, Friction, Polygon, Scales, Scene
+from wholearm.scene.model import Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.system import ContactPair, Structure, System, build_system, measure_gaps
@@ -38,18 +38,12 @@ def throw(seed: int) -> Simulation:
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     corners = size * np.column_stack([np.cos(angles), rng.uniform(0.4, 1.0) * np.sin(angles)])
     radius = float(rng.choice([0.0, 0.005]))
-    fingers = tuple(
-        Finger(
-            base=[side * rng.uniform(0.07, 0.12), -0.01],
-            length=rng.uniform(0.1, 0.2),
-            radius=radius,
-            inertia=rng.uniform(1e-4, 5e-3),
-            viscous=rng.choice([0.0, 0.01]),
-            dry=rng.choice([0.0, 0.02]),
-            torque_limit=2.0,
-        )
-        for side in (1.0, -1.0)
-    )
+    fingers = []
+    for side in (1.0, -1.0):
+        link = make_finger([side * rng.uniform(0.07, 0.12), -0.01], rng.uniform(0.1, 0.2), radius)
+        inertia, viscous = rng.uniform(1e-4, 5e-3), rng.choice([0.0, 0.01])
+        drag = {"viscous": viscous, "dry": rng.choice([0.0, 0.02])}
+        fingers.append(dataclasses.replace(link, inertia=inertia, **drag))
     mu = rng.uniform(0, 1, 3) * rng.choice([0.0, 1.0], p=[0.2, 0.8])
     scene = Scene(Polygon(corners, 0.2), (fingers[0], fingers[1]), Friction(*mu.tolist()))
     z = np.zeros(5)

@@ -42,15 +42,8 @@ class Polynomials:
         z = [np.polynomial.Polynomial(c) for c in rng.uniform(-1, 1, (5, 6))]
         lines = rng.uniform(-1, 1, (2, 2 + 2 * len(self.contacts)))
         forces = lines[0] + np.asarray(t)[:, None] * lines[1]
-        m = len(self.contacts)
-        return Samples(
-            np.column_stack([p(t) for p in z]),
-            np.column_stack([p.deriv()(t) for p in z]),
-            np.column_stack([p.deriv(2)(t) for p in z]),
-            forces[:, :2],
-            forces[:, 2 : 2 + m],
-            forces[:, 2 + m :],
-        )
+        motion = [np.column_stack([own.deriv(k)(t) for own in z]) for k in range(3)]
+        return Samples(*motion, *np.split(forces, [2, 2 + len(self.contacts)], axis=1))
 
 
 MOTIONS = (
