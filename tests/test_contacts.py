@@ -319,17 +319,14 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
     assert np.isfinite(np.array(function(np.ones(5)))).all()
 
 
-COUNT = 400
-
-
 def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     """A hand with links that are just long enough: labels, poses, and the hand closed there."""
     scene = make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)
-    x, phi = rng.uniform(-0.06, 0.06, COUNT), rng.uniform(-4, 4, COUNT)
+    x, phi = rng.uniform(-0.06, 0.06, 400), rng.uniform(-4, 4, 400)
     labels = label_cells(scene, x, phi)[:, [0, 2, 4]]
     usable = (labels >= 0).all(axis=1)
-    assert usable.sum() > COUNT / 4
+    assert usable.mean() > 0.25
     labels, x, phi = labels[usable], x[usable], phi[usable]
     return scene, labels, np.column_stack([x, phi]), close_fingers(scene, x, phi).z
 

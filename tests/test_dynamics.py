@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise, permutations, product
 from pathlib import Path
 from typing import Any
@@ -195,21 +196,11 @@ def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
 MASS = 0.2
 
 
+@cache
 def chain_of(path: Path) -> ImpactSequence:
+    """Two of the four impacts are possible with a rough right finger, and none without."""
     problem = problem_of(path)
     return make_sequence(problem.phases, trace_phases(problem))
-
-
-@pytest.fixture(scope="module")
-def rough() -> ImpactSequence:
-    """With a rough right finger: two impacts that are possible, and two that are not."""
-    return chain_of(IMPACTS)
-
-
-@pytest.fixture(scope="module")
-def tipping() -> ImpactSequence:
-    """With four that are not."""
-    return chain_of(HEPTAGON)
 
 
 def check_momenta(impact: Impact, z: Array, before: Array) -> None:
@@ -222,10 +213,9 @@ def check_momenta(impact: Impact, z: Array, before: Array) -> None:
     np.testing.assert_allclose(change, impulse, rtol=0, atol=1e-12)
 
 
-def test_each_body_takes_its_impulses_as_complementarity_says(
-    rough: ImpactSequence, tipping: ImpactSequence
-) -> None:
-    for chain in (rough, tipping):
+def test_each_body_takes_its_impulses_as_complementarity_says() -> None:
+    rough = chain_of(IMPACTS)
+    for chain in (rough, chain_of(HEPTAGON)):
         for join, (one, other) in zip(chain.impacts, pairwise(chain.curves), strict=True):
             z, v = other.start, one.evaluate(np.array([one.length])).z_s[0]
             before, after = one.formation, other.formation
@@ -251,7 +241,8 @@ def test_each_body_takes_its_impulses_as_complementarity_says(
                 assert not np.allclose(collision.v, impact.v, atol=0.1)
 
 
-def test_what_would_have_to_pull_is_named(tipping: ImpactSequence) -> None:
+def test_what_would_have_to_pull_is_named() -> None:
+    tipping = chain_of(HEPTAGON)
     impact = tipping.impacts[0].impact
     assert impact.least == ("v1-palm", float(impact.p[1]))
     first = impact.violations[0]
@@ -387,9 +378,9 @@ def test_what_touches_must_not_be_driven_into() -> None:
 # Curves that impacts join.
 
 
-def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
+def test_paces_make_the_speed_continuous() -> None:
     """A velocity of z_s on one curve becomes z_s on the next."""
-    part = rough.split()[0]
+    part = chain_of(IMPACTS).split()[0]
     curves = part.continuous_curves
     assert curves[0].speed_ratio == 1.0
     for join, (before, after) in zip(part.impacts, pairwise(curves), strict=True):
@@ -399,8 +390,8 @@ def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
         check_momenta(replace(join.impact, v=v_after, p=impulses), before.end, v)
 
 
-def test_a_curve_at_another_pace(rough: ImpactSequence) -> None:
-    curve = rough.curves[2]
+def test_a_curve_at_another_pace() -> None:
+    curve = chain_of(IMPACTS).curves[2]
     fast = curve.with_speed_ratio(2.5)
     assert fast.length == pytest.approx(curve.length / 2.5, rel=1e-13)
     np.testing.assert_allclose(fast.end, curve.end, rtol=0, atol=1e-14)

@@ -369,6 +369,9 @@ def test_axes_cells_edges_and_phases_are_named(picture: Figure, chart: Formation
     assert {"v1 | v3 | v6", "v1 | v4 | v6", "v0 | v3 | v5", "v0 | e2 | v0"} <= set(shown)
     assert [text for text in shown if text.isdigit()] == ["1", "2", "3", "4", "5"]
     assert {f"edge {edge} on\nthe palm" for edge in (6, 0, 1)} <= set(shown)
+    # Nothing is clipped, and labels do not overlap.
+    FigureCanvasAgg(picture)
+    check_layout(picture, 7.0)
 
 
 def test_labels_are_inside_their_cells(picture: Figure, chart: FormationMap) -> None:
@@ -397,11 +400,6 @@ def test_directed_lines_are_where_motion_is_possible(picture: Figure, chart: For
         for segment in by_colour[colour].get_segments():
             for point in np.asarray(segment)[:: len(segment) // 3 + 1]:
                 assert (np.abs(places - point) < slack).all(axis=1).any()
-
-
-def test_nothing_is_clipped_and_labels_do_not_overlap(picture: Figure) -> None:
-    FigureCanvasAgg(picture)
-    check_layout(picture, 7.0)
 
 
 def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory) -> None:
@@ -692,14 +690,11 @@ class Tour(Result):
         return self.judge(self.name, "a <reason>", ["a line", "", table, "the end"])
 
 
-TOUR = Tour(
-    "tour",
-    (
-        Visit(1, Place(0.0125, "edge & tip"), (1.0, -2.0), 0.5),
-        Visit(20, None, (0.25, 0.125), math.nan),
-    ),
-    np.zeros(3),
+VISITS = (
+    Visit(1, Place(0.0125, "edge & tip"), (1.0, -2.0), 0.5),
+    Visit(20, None, (0.25, 0.125), math.nan),
 )
+TOUR = Tour("tour", VISITS, np.zeros(3))
 
 
 def test_text_is_lines_and_aligned_tables() -> None:

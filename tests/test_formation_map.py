@@ -187,14 +187,11 @@ def test_borders_have_four_closed_contacts_and_edges_flush_on_palm_or_link(
             heading = 0.0 if finger is None else z[3 + finger]
             across = run @ np.array([-np.sin(heading), np.cos(heading)])
             assert abs(across) < 1e-9
-
-
-def test_crossings_have_five_closed_contacts(every: FormationMap) -> None:
+    # Crossings have five.
     assert sum(len(crossing.flush) >= 2 for crossing in every.crossings) > 5
     for crossing in every.crossings:
         assert len(crossing.contacts) >= 5
-        worst = np.abs(gaps(every.problem.scene, crossing.contacts, crossing.z[None])).max()
-        assert worst < 1e-9
+        assert np.abs(gaps(scene, crossing.contacts, crossing.z[None])).max() < 1e-9
 
 
 def test_every_change_of_cell_is_a_border(every: FormationMap) -> None:

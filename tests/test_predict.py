@@ -232,13 +232,22 @@ def tune_box() -> wholearm.Tuning:
     return wholearm.tune(light_box(), brake=True)
 
 
-def test_tuned_torques_hold_every_contact_and_end_at_rest() -> None:
+def test_tuned_torques_hold_every_contact_end_at_rest_and_are_written(tmp_path: Path) -> None:
     found = tune_box()
     assert found.ok and found.exit_status == 0 and found.report is not None
     whole = found.report.whole
     assert np.nanmin(whole.c_n) > 0 and whole.z[-1, 0] == pytest.approx(-0.01, abs=1e-6)
     assert not whole.z_dot[-1].any()
     assert found.simulations > len(found.phases[0].trials)
+    path = tmp_path / "tuned.csv"
+    path.write_text(found.to_csv())
+    torque = wholearm.read_torque_csv(str(path))
+    assert found.torque is not None
+    assert np.array_equal(torque.breaks, found.torque.breaks)
+    assert np.array_equal(torque.coefficients, found.torque.coefficients)
+    assert read_notes(str(path))["simulations"] == str(found.simulations)
+    assert f"{found.simulations} simulations" in found.to_text()
+    assert found.to_dict()["phases"][0]["trials"][0]["outcome"] == "rests"
 
 
 def test_torques_are_quasistatic_ones_in_steps_of_ten_percent() -> None:
@@ -255,18 +264,6 @@ def test_torques_are_quasistatic_ones_in_steps_of_ten_percent() -> None:
     times = [trial.time for trial in slides]
     assert times == sorted(times, reverse=True), "more torque brings it there sooner"
     assert drives[0].outcome is TrialOutcome.RESTS, "quasistatic torques set nothing in motion"
-
-
-def test_the_table_is_what_was_judged(tmp_path: Path) -> None:
-    found, path = tune_box(), tmp_path / "tuned.csv"
-    path.write_text(found.to_csv())
-    torque = wholearm.read_torque_csv(str(path))
-    assert found.torque is not None
-    assert np.array_equal(torque.breaks, found.torque.breaks)
-    assert np.array_equal(torque.coefficients, found.torque.coefficients)
-    assert read_notes(str(path))["simulations"] == str(found.simulations)
-    assert f"{found.simulations} simulations" in found.to_text()
-    assert found.to_dict()["phases"][0]["trials"][0]["outcome"] == "rests"
 
 
 def test_constant_torques_do_not_come_to_rest() -> None:
@@ -545,7 +542,9 @@ def simulation() -> Simulation:
     return simulate(problem_of(HEPTAGON), plan()[1].torque, times=np.linspace(0, 2, 301))
 
 
-def test_a_replay_is_a_trajectory(simulation: Simulation) -> None:
+def test_a_replay_is_a_trajectory_and_survives_its_file(
+    simulation: Simulation, tmp_path: Path
+) -> None:
     found, torque = simulation.trajectory, plan()[1].torque
     assert isinstance(found, Trajectory) and found.torque is torque
     assert found.contacts == simulation.contacts and len(found.motions) == 5
@@ -560,14 +559,11 @@ def test_a_replay_is_a_trajectory(simulation: Simulation) -> None:
     replay = simulate(simulation.problem, torque, times=times)
     exact = [replay.at(t)[:5] for t in times]
     np.testing.assert_allclose(found.at(times).z, exact, rtol=0, atol=1e-8)
-
-
-def test_a_replay_survives_its_file(simulation: Simulation, tmp_path: Path) -> None:
     save(simulation, tmp_path / "a.npz")
-    loaded, known = load_trajectory(tmp_path / "a.npz"), simulation.trajectory
+    loaded = load_trajectory(tmp_path / "a.npz")
     for name in ("t", "tau", "c_n", "phase", "z", "z_ddot"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(known, name))
-    assert loaded.meta == known.meta and loaded.meta["status"] == "replayed"
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(found, name))
+    assert loaded.meta == found.meta and loaded.meta["status"] == "replayed"
     report = verify(simulation.problem, loaded)
     assert report.ok and report.phases[-1].deviation is not None
     assert report.phases[-1].deviation.position < 1e-8
