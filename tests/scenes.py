@@ -365,4 +365,4 @@ def reversing() -> Problem:
             {contacts = ["v5-palm", "v8-finger1", "v2-finger2"],
             until = {x = -0.3511, phi_deg = -6.519}}]
     """
-    return build_problem(tomllib.loads(" ".join(text.split("\n            "))))
+    return read_lines(text)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, pairwise, takewhile
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 from ..common.parallel import Task, share
 from ..common.signals import Reporter, beat
@@ -353,7 +353,7 @@ class RoutePlanner:
         planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
         if isinstance(planned, Lost):
             return planned
-        reached = sum(one.motion.duration for _, one in planned)
+        reached = sum(plan.motion.duration for _, plan in planned)
         before: tuple[Phase, ...] = ()
         if self.before:
             before, reached = self.before.problem.phases, self.before.duration + reached
@@ -392,7 +392,8 @@ class RoutePlanner:
             begin = replace(problem, start=part[0][0].start.z)
             # Coarse plans of other motors are no guesses.
             made = None if lost else plan_part(begin, part, options, tell, problem is self.problem)
-            lost.extend([made] if isinstance(made, Lost) else ())
+            if isinstance(made, Lost):
+                lost.append(made)
             return made
 
         known = self.roadmap.part_plans
@@ -415,7 +416,8 @@ class RoutePlanner:
         for k in order:
             if isinstance(made := known.get(keys[k]), Lost):
                 return made
-        return [pair for key in keys for pair in known[key] if not isinstance(pair, str)]
+        # None is lost, and so all are planned.
+        return [pair for key in keys for pair in cast(list[PlannedPhase], known[key])]
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""

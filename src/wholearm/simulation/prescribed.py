@@ -620,7 +620,7 @@ class Replay(Run):
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
-            # The same phase, for the least time, turns back 5 nm before its end.
+            # Phase 1 of scene 584 of seed 1128 turns 5 nm before its end, for the least time.
             return self._reach()
         return self.restart(turning)
 
