@@ -366,3 +366,23 @@ def reversing() -> Problem:
             until = {x = -0.3511, phi_deg = -6.519}}]
     """
     return read_lines(text)
+
+
+@cache
+def grazing() -> Problem:
+    """A quadrangle whose edge comes to a fingertip along its tangent."""
+    text = """
+        epsilon = 0.001509
+        object.mass = 0.02129
+        object.vertices = [[0.1948, 0.1413], [-0.02686, 0.0126], [-0.1794, -0.1426],
+            [-0.000713, -0.03288]]
+        fingers.1 = {base = [0.2756, -0.05723], length = 0.5746, radius = 0.01182,
+            inertia = 1.247e-05, viscous = 1.478e-06, dry = 0.001399, torque_limit = 0.2809}
+        fingers.2 = {base = [-0.3172, -0.1024], length = 0.4376, radius = 0.002831,
+            inertia = 5.116e-07, viscous = 9.438e-08, dry = 0.0018, torque_limit = 0.3006}
+        friction = {palm = 0.07068, finger1 = 0.1866, finger2 = 0.1219}
+        start = {flush = 2, x = 0.02019}
+        phases = [{contacts = ["v2-palm", "v3-palm", "v0-finger1", "v2-finger2"],
+            until = "e1-tip2"}]
+    """
+    return read_lines(text)

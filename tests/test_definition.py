@@ -114,6 +114,11 @@ def test_both_freedoms_of_a_cell_may_be_given(given: dict[str, Any], text: str) 
     again = read_edited(put("phases.3", written)).phases[3].until
     assert again == problem.phases[3].until
     assert tomllib.loads(f"until = {format_until(again)}")["until"] == pytest.approx(given)
+    if "x" in given and "phi_deg" in given:
+        # In either order the coordinate with the longer way ends the phase.
+        for start, first in (([0.06, 0, -0.7, 0, 0], "x"), ([0.011, 0, -0.6, 0, 0], "phi")):
+            led = again.lead(np.array(start), 0.05)
+            assert led.coordinate == first and sorted(led.coordinates) == sorted(again.coordinates)
 
 
 MODES = [

@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
-from scenes import measure_fingers, reversing
+from scenes import grazing, measure_fingers, reversing
 from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from wholearm import Problem
 from wholearm.common.arrays import Array
@@ -296,3 +296,11 @@ def test_a_border_is_left_where_the_motion_turns_back(objective: str) -> None:
     plan = solve(reversing(), objective, accuracy=1e-2).trajectory
     before, after = plan.at(plan.phase_starts[1] + np.array([-1e-4, 1e-4])).z_dot[:, 0]
     assert before < 0 < after
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_a_tangential_contact_is_reached_at_rest(objective: str) -> None:
+    """Its gap vanishes with the square of the way left, and is no distance to the end of that."""
+    plan = solve(grazing(), objective, accuracy=1e-2)
+    assert plan.replay is not None
+    assert np.abs(plan.trajectory.z_dot[-1]).max() < 1e-6

@@ -143,7 +143,8 @@ class Bench:
     ) -> None:
         self.problem, self.passage, self.z, self.tell = problem, passage, z, tell
         self.system = build_system(problem.scene)
-        until, names = passage.until, self.system.names
+        until = passage.until.lead(z, problem.scene.scales.length)
+        names = self.system.names
         self.pair = None if until.contact is None else names.index(until.contact.name)
         self.column = 0 if until.coordinate == "x" else 2
         self.value = math.nan if until.value is None else until.value

@@ -99,6 +99,20 @@ class Until:
         off = (abs(z[ROWS[name]] - value) / units[name] for name, value in self.pins)
         return float(max(off, default=0.0))
 
+    def lead(self, z: Array, length: float) -> Until:
+        """The same with the coordinate first that has the longest way from z, shape (5,).
+
+        That one ends the phase. Ways of x are over a `length`, those of phi in rad.
+        """
+        if self.value is None or not self.pins:
+            return self
+        units = {"x": length, "phi": 1.0}
+        ways = [abs(z[ROWS[name]] - value) / units[name] for name, value in self.coordinates]
+        first, *pins = sorted(
+            self.coordinates, key=lambda pair: -ways[self.coordinates.index(pair)]
+        )
+        return replace(self, coordinate=first[0], value=first[1], pins=tuple(pins))
+
     @property
     def is_release(self) -> bool:
         """Whether the phase ends by a release, where the planner chooses."""
@@ -127,8 +141,8 @@ class Until:
     key(
         "until",
         "What ends the phase: a contact that is gained, or a coordinate; with two freedoms also "
-        "both, or both coordinates, the first of which ends it. Left out with end = 'smooth': "
-        "where the planner lets a contact go.",
+        "both, or both coordinates: the one with the longer way ends it. Left out with end = "
+        "'smooth': where the planner lets a contact go.",
         leave({}),
         default=None,
     ),

@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple, NoReturn, cast
 
@@ -566,7 +567,7 @@ class Replay(Run):
         elif self.phase.end is End.IMPACT and self._strikes():
             coming = self.piece + 1
             speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
-        elif self.phase.end is not End.SMOOTH and self.formation.n_constraints < 4:
+        elif self.phase.end is not End.SMOOTH:
             units = self.system.units[5:]
             speed = float(np.abs(self.s.outputs[5:10] / units).max())
         return speed < SLOW
@@ -663,8 +664,9 @@ class Replay(Run):
         contacts of `resting` come to rest, as they roll in the next phase, or one of `slipping`
         slips.
         """
-        formation, until = phase.formation, phase.until
-        self.phase, self.phase_index, old = phase, phase.index, self.system.stored(self.z, self.v)
+        formation, old = phase.formation, self.system.stored(self.z, self.v)
+        until = phase.until.lead(self.z, self.system.scales.length)
+        self.phase, self.phase_index = replace(phase, until=until), phase.index
         self.y[:5] = self._close(formation)
         self.impact += float(old - self.system.stored(self.z, self.v))
         self.project_velocity(formation.evaluate(self.z[None], self.v[None]).P[0])

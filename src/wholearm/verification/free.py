@@ -213,7 +213,8 @@ def _find_end(
     simulation: FreeSimulation, phase: Phase, after: Phase | None, start: float
 ) -> float | None:
     """When a phase ends, None if it does not [s]."""
-    until = phase.until
+    start_row = int(np.searchsorted(simulation.t, start))
+    until = phase.until.lead(simulation.z[start_row], simulation.problem.scene.scales.length)
     later = [event for event in simulation.events if event.time >= start]
     if until.contact is not None:
         times = [e.time for e in later if e.contact == until.contact.name]

@@ -67,15 +67,16 @@ def judge_end(simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
     By rounding the torques may end within a hair of the goal.
     """
     problem, outcome = simulation.problem, simulation.outcome
-    last = problem.phases[-1]
+    last, length = problem.phases[-1], problem.scene.scales.length
     if outcome.reached:
         return True, outcome.text
     missed = abs(simulation.missed_by)
-    is_angle = last.until.coordinate == "phi"
+    start = simulation.z[np.searchsorted(simulation.phase, simulation.phase[-1])]
+    is_angle = last.until.lead(start, length).coordinate == "phi"
     near = (
         outcome.kind is OutcomeKind.GOAL_MISSED
         and int(simulation.phase[-1]) == last.index
-        and missed <= 3e-4 * (1.0 if is_angle else problem.scene.scales.length)
+        and missed <= 3e-4 * (1.0 if is_angle else length)
         and measure_speed(problem.scene, simulation.z_dot[-1])
         <= allowance.rest_speed * problem.scene.scales.speed
     )
@@ -104,7 +105,7 @@ def describe_failures(
     problem, scene = simulation.problem, simulation.problem.scene
     for event in simulation.find(EventKind.ARRIVAL):
         phase = problem.phases[event.phase]
-        row = int(np.flatnonzero(simulation.phase == event.phase)[-1])
+        first, row = np.flatnonzero(simulation.phase == event.phase)[[0, -1]].tolist()
         z, v = simulation.z[row], simulation.z_dot[row]
         if phase.until.measure_pins(z, scene.scales.length) > allowance.departure:
             text = f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
@@ -117,7 +118,8 @@ def describe_failures(
             if scene.scales.length * turns[fastest] > speed:
                 body = ("the object", "finger 1", "finger 2")[fastest]
                 moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
-            unit = "rad/s" if phase.until.coordinate == "phi" else "m/s"
+            until = phase.until.lead(simulation.z[first], scene.scales.length)
+            unit = "rad/s" if until.coordinate == "phi" else "m/s"
             text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
                 f"{event.value:.3g} {unit} at t = {event.time:.5g} s, while {moves}, with "

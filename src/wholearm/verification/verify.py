@@ -19,7 +19,7 @@ from ..mechanics.dynamics import Directions, force_rows
 from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
 from ..mechanics.statics import Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
-from ..problem.definition import End, Phase, Problem
+from ..problem.definition import End, Phase, Problem, Until
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.report import (
@@ -41,6 +41,7 @@ from ..results.report import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
+from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import (
     Response,
@@ -609,7 +610,8 @@ def _examine_loss(
         row = int(rows[simulation.t[rows] <= time][-1])
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
-    distance = _measure_distance(phase, z[None], v[None])
+    until = phase.until.lead(simulation.z[rows[0]], problem.scene.scales.length)
+    distance = _measure_distance(until, problem.scene, z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
@@ -680,10 +682,11 @@ def find_approach(simulation: Simulation) -> Approach | None:
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
     rows = np.flatnonzero(simulation.phase == phase.index)
     t, v = simulation.t[rows], simulation.z_dot[rows]
-    distance = _measure_distance(phase, simulation.z[rows], v)
+    until = phase.until.lead(simulation.z[rows[0]], scales.length)
+    distance = _measure_distance(until, problem.scene, simulation.z[rows], v)
     if distance is None:
         return None
-    is_angle = phase.until.coordinate == "phi"
+    is_angle = until.coordinate == "phi"
     gaps, gradient, _ = distance
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps)
@@ -701,16 +704,17 @@ def find_approach(simulation: Simulation) -> Approach | None:
     )
 
 
-def _measure_distance(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
+def _measure_distance(
+    until: Until, scene: Scene, z: Array, v: Array
+) -> tuple[Array, Array, Array] | None:
     """Distance to the end of a phase at n states, its gradient, (n, 5), and its bend, (n,).
 
     The bend is what the velocity alone adds to its second derivative, towards the end.
     """
-    until = phase.until
     if until.is_release:
         return None
     if until.contact is not None:
-        at = Formation(phase.formation.scene, (until.contact,)).evaluate(z, v)
+        at = Formation(scene, (until.contact,)).evaluate(z, v)
         return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
     column = 0 if until.coordinate == "x" else 2
     assert until.value is not None

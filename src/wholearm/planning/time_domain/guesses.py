@@ -620,9 +620,9 @@ def guess_stages(
     for k, (phase, outline, last) in enumerate(parts):
         ahead = None
         if phase.until.value is not None:
-            row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
-            begin = next(other.z[0, row] for owner, other, _ in parts if owner is phase)
-            ahead = row, value, 1.0 if value > begin else -1.0
+            start = next(other.z[0] for owner, other, _ in parts if owner is phase)
+            row, value = phase.until.lead(start, 1.0).poses[0]
+            ahead = row, value, 1.0 if value > start[row] else -1.0
         whole = lengths[[owner is phase for owner, _, _ in parts]].sum()
         intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
