@@ -123,8 +123,10 @@ def verify_policy(
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
         number, start, gained = phase.number, loop.began[phase.number], phase.until.contact
         stop = loop.began.get(number + 1, float(whole.t[-1]))
-        name = "" if gained is None else gained.name
-        gains = [s.start for s in whole.stretches if s.contact == name and s.start > start]
+        after = problem.phases[number].formation.contacts if number < count else ()
+        # Beyond a border the gained contact may press as that of another feature.
+        names = {c.name for c in (gained, *after) if c is not None} - set(phase.formation.names)
+        gains = [s.start for s in whole.stretches if s.contact in names and s.start > start]
         losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed, moment))
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
