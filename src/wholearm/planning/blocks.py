@@ -24,13 +24,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.document import plain
-from ..common.errors import (
-    InfeasibleError,
-    InputError,
-    SolverError,
-    WholearmError,
-    name_source,
-)
+from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError, name_source
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import CostToGo, split_blocks, trace_phase
@@ -67,7 +61,7 @@ class BlockPlan:
     start: Array  # (5,)
     plans: Plans  # one for each of its phases
     chain: ImpactSequence | None  # its curves; None in the time domain
-    coarse: bool = False  # whether its plans may miss limits between points
+    coarse: bool = False  # whether its plans are a guess: they may miss limits between points
 
     @property
     def end(self) -> Array:
@@ -145,12 +139,11 @@ def plan_blocks(
         first = replace(
             planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
         )
-        least = plan_each(_begin_each(first, report), report).plans
+        least = plan_each(first, report).plans
         times = [plan.motion.duration for plan in least]
         longest = 2 * sum(times) if options.duration is None else options.duration
         planning = replace(planning, allowed=share_duration(times, longest), least=least)
-        return plan_each(planning, report)
-    return plan_each(_begin_each(planning, report), report)
+    return plan_each(planning, report)
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
@@ -161,48 +154,13 @@ def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     return _require_margin(made)
 
 
-def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
-
-    Blocks along curves after it have none, as they will begin elsewhere: they are traced alone. An
-    error is raised only if it does not depend on where exactly the block before ends.
-    """
-    blocks, coarse = split_blocks(planning.problem), planning
-    over_time = [not runs_along_curves(block, planning.options) for block in blocks]
-    scene = planning.problem.scene
-    if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
-        return planning
-    for index, block in enumerate(blocks):
-        try:
-            if any(over_time[:index]) and not over_time[index]:
-                z = coarse.blocks[-1].end
-                traced = BlockPlan(block, z, [], trace_block(coarse, block, z), coarse=True)
-                coarse = replace(coarse, blocks=(*coarse.blocks, traced))
-            else:
-                coarse = plan_next(coarse, None, report, coarse=True)
-        except WholearmError as error:
-            short = error.shortfalls if isinstance(error, InfeasibleError) else ()
-            # A better plan of earlier phases does not help against large violations.
-            if not any(over_time[:index]) or any(shortfall.share > 0.05 for shortfall in short):
-                raise
-            break
-    return coarse
-
-
 def plan_next(
-    planning: Planning,
-    known: BlockPlan | None,
-    report: Callable[[str], None],
-    coarse: bool = False,
+    planning: Planning, known: BlockPlan | None, report: Callable[[str], None]
 ) -> Planning:
-    """Plan the next block, in the time domain coarsely if asked, unless `known` is its plan.
-
-    A coarse one is the guess.
-    """
+    """Plan the next block, unless `known` is its plan; a coarse one is the guess."""
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
     z = planning.blocks[-1].end if planning.blocks else problem.start
-    coarse = coarse and not runs_along_curves(phases, options)
     rounding = 1e-9 * problem.scene.scales.length
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.coarse:
@@ -220,18 +178,13 @@ def plan_next(
                 ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                 fastest=[least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.coarse else (),
-                only_begin=coarse,
             )
-        known = BlockPlan(phases, z, *made, coarse)
+        known = BlockPlan(phases, z, *made)
     return replace(planning, blocks=(*planning.blocks, known))
 
 
 def plan_block(
-    planning: Planning,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-    **over_time: Any,
+    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves.
 
@@ -279,8 +232,7 @@ def _plan_over_time(
     slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
     pinned = block[-1].index + 1 < len(problem.phases)
     for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-        modes = replace(options, mode_search=complete)
-        free = plan_free(planning, block, z, modes, **over_time)
+        free = plan_free(planning, block, z, replace(options, mode_search=complete), **over_time)
         plan: Callable[[float | None], Plans] = partial(
             plan_with_impacts, problem, block, z, options, pinned=pinned, free=free, **over_time
         )
@@ -309,8 +261,7 @@ def plan_with_pauses(
     def list_changes(plans: Plans) -> list[TorqueChange]:
         """From the torques before each phase to its first ones."""
         before = block_before.plans[-1].end_torques[1] if block_before else plans[0].end_torques[0]
-        lasts = [before, *(plan.end_torques[1] for plan in plans[:-1])]
-        pairs = zip(lasts, plans, strict=True)
+        pairs = zip([before, *(plan.end_torques[1] for plan in plans[:-1])], plans, strict=True)
         return [change_torques(scene, last, plan.end_torques[0]) for last, plan in pairs]
 
     plans = plan(duration)
@@ -368,11 +319,7 @@ def _require_margin(planning: Planning) -> Planning:
     return planning
 
 
-def look_ahead(
-    planning: Planning,
-    block: Sequence[Phase],
-    options: PlanOptions,
-) -> CostToGo | None:
+def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
     """Cost-to-go of a block in the time domain with a free end on a curve.
 
     Without limits of motors: its gradient is nearly the same, and soon known.
@@ -410,8 +357,7 @@ def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
         try:
             return look_along((trace_phase(phase, z),), epsilon, intervals=24)
         except NoMotionError:
-            text = f"phase {phase.number}: no motion keeps the limits"
-            raise SolverError(text) from None
+            raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
 
     return CostToGo(phase, value)
 
@@ -512,11 +458,7 @@ class ImpactSequence:
         )
 
     def plan(
-        self,
-        epsilon: float,
-        options: PlanOptions,
-        duration: float | None = None,
-        **others: Any,
+        self, epsilon: float, options: PlanOptions, duration: float | None = None, **others: Any
     ) -> Plans:
         """Plan phases that possible impacts join, from rest to rest; see `plan_curves`."""
         numbers = [phase.number for phase in self.phases]
@@ -541,8 +483,7 @@ class ImpactSequence:
         for plan, join in zip(plans, self.impacts, strict=False):
             phase = join.phase
             if phase.end is End.IMPACT:
-                v = end_of(plan)[1] * join.possible
-                speed = measure_speed(phase.formation.scene, v)
+                speed = measure_speed(phase.formation.scene, end_of(plan)[1] * join.possible)
                 impacts.append(make_transition(phase, join.impact, join.ratio, join.reason, speed))
         return impacts
 

@@ -74,14 +74,9 @@ def choose_junction(
     beginning            curve that begins, or its formation in the time domain: then the final
                          torques before are those that friction holds with the largest margin
 
-    Notes
-    -----
     Where none of the torques hold the object in the formation that begins, contacts that it does
-    not have any more help to hold it until the motion begins.
-
-    Raises
-    ------
-    InfeasibleError  if no torques hold the object at one of the two ends
+    not have any more help to hold it until the motion begins. InfeasibleError if no torques hold
+    the object at one of the two ends.
     """
     if isinstance(ending, Curve):
         before, ends = _list_torques(ending, epsilon, phase - 1, -1)
@@ -116,12 +111,7 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
 
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
-    """The range of internal forces that hold the object at an end of a phase [N].
-
-    Raises
-    ------
-    InfeasibleError  if there is none
-    """
+    """The range of internal forces that hold the object at an end of a phase [N], or an error."""
     low, high = (float(bound[place]) for bound in find_internal_force_range(data, 0.0))
     if low <= high:
         return low, high
@@ -194,8 +184,7 @@ def add_pause(
 
 def _pause(plan: PhasePlan[Motion], change: TorqueChange, forces: Array) -> PhasePlan[Motion]:
     motion = PausedMotion(plan.motion, change, forces)
-    torque = TorqueProfile.chain([change.torque, plan.torque])
-    return plan._replace(motion=motion, torque=torque)
+    return plan._replace(motion=motion, torque=TorqueProfile.chain([change.torque, plan.torque]))
 
 
 def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> PhasePlan[Motion]:
@@ -241,8 +230,7 @@ def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
     standstills = list[Standstill | None]()
     for phase, plan in zip(problem.phases, plans, strict=True):
         z, v = end_of(plan)
-        touching = list_touching(problem, phase)
-        place = Standstill(z, phase.formation, phase.until.contact, touching)
+        place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
         standstills.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
     return standstills
 
@@ -327,20 +315,13 @@ def list_touching(problem: Problem, phase: Phase) -> Formation:
     return Formation(problem.scene, tuple(dict.fromkeys(contacts)))
 
 
-class DwellAllocation(NamedTuple):
-    """Relative dwell times of ends that gain a contact."""
-
-    first: float  # time of the first of them, over the others
-    last: float  # time of the plan's last end
-    firm: bool  # as of `DwellEnd`
-
-
+# Dwell times of the first end that gains a contact and of the plan's last end, over those of the
+# other ends that gain one, and `DwellEnd.firm`, in the order in which they are tried.
 ALLOCATIONS = (
-    DwellAllocation(2.0, 1.0, firm=True),
-    DwellAllocation(0.0, 0.0, firm=True),  # heptagon at 5 %
-    DwellAllocation(0.0, 0.0, firm=False),  # heptagon_twice at 5 %
+    (2.0, 1.0, True),
+    (0.0, 0.0, True),  # heptagon at 5 %
+    (0.0, 0.0, False),  # heptagon_twice at 5 %
 )
-"""Allocations in the order in which they are tried, with problems that take them."""
 STOP = 0.06  # relative dwell time of an end that gains no contact
 
 
@@ -354,20 +335,20 @@ def share_time(
     times = [problem.settles(phase) for phase in problem.phases]
     whole = problem.settle_share * sum(plan.motion.duration for plan in plans)
     best, least = list[DwellEnd | None](), math.inf
-    for allocation in ALLOCATIONS:
+    for first, last, firm in ALLOCATIONS:
         weights, gained = np.zeros(len(times)), 0
         for k, place in enumerate(places):
             if place is None or times[k] is not None:
                 continue
             closes = find_opening(place) is not None
-            weights[k] = (1.0 if gained else allocation.first) if closes else STOP
+            weights[k] = (1.0 if gained else first) if closes else STOP
             gained += closes
         if gained > 1:
-            weights[-1] *= allocation.last
+            weights[-1] *= last
         shares = whole * weights / max(float(weights.sum()), STOP**2)
         pairs = zip(shares.tolist(), times, strict=True)
         allotted = [share if time is None else time for share, time in pairs]
-        ends = find_ends(problem, places, allotted, allocation.firm)
+        ends = find_ends(problem, places, allotted, firm)
         off = measure_off(problem, plans, ends) if any(ends) else 0.0
         if not best or off < 0.8 * least:  # a later one has to be better by a fifth
             best, least = ends, off

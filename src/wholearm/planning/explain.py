@@ -44,12 +44,10 @@ from .dwell import require_hold
 from .nlp import open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, cut, fit_torque, join
-from .path_domain.path_motion import PathMotion, Profile
+from .path_domain.path_motion import PathMotion
 from .path_domain.path_nlp import (
     LimitShape,
-    Relaxation,
     Tightening,
-    Units,
     build_path_nlp,
     guess_slowly,
     make_bounds,
@@ -57,7 +55,7 @@ from .path_domain.path_nlp import (
     parameters,
     unpack,
 )
-from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
+from .path_domain.path_plan import Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -91,11 +89,8 @@ def advise(
 ) -> E:
     """Add to an error the changes of a single parameter that make a plan possible.
 
-    Parameters
-    ----------
-    list_values  as of `find_changes`; None where it cannot tell
-    replan       None: no change is looked for
-    most         iterations of solvers after which no further change is tried
+    `list_values` are as of `find_changes`, None where it cannot tell. Without `replan`, and after
+    `most` iterations of solvers, no change is looked for.
     """
     if replan is None or _unadvised.get():
         return error
@@ -113,7 +108,13 @@ def advise(
             return values or ()
 
         def can_plan(parameter: Parameter, value: float) -> bool:
-            return not is_over(parameter) and succeeds(partial(replan, parameter, value))
+            if is_over(parameter):
+                return False
+            try:
+                replan(parameter, value)
+            except (InfeasibleError, SolverError, JammingError, InputError):
+                return False
+            return True
 
         error.changes = tuple(find_changes(parameters, list_more, can_plan))
     text = describe_changes(error.changes)
@@ -123,15 +124,6 @@ def advise(
     return error
 
 
-def succeeds(plan: Callable[[], object]) -> bool:
-    """Whether there is a plan."""
-    try:
-        plan()
-    except (InfeasibleError, SolverError, JammingError, InputError):
-        return False
-    return True
-
-
 def find_changes(
     parameters: Iterable[Parameter],
     list_values: Callable[[Parameter], Sequence[float]],
@@ -139,10 +131,7 @@ def find_changes(
 ) -> list[Change]:
     """Changes of a single parameter with which there is a plan, to values rounded outwards.
 
-    Parameters
-    ----------
-    list_values  a value of a parameter without a plan, or NaN, and values to try in their order
-    can_plan     whether there is a plan with a value of a parameter
+    `list_values` returns a value of a parameter without a plan, or NaN, and values to try in order.
     """
     changes = []
     for parameter in parameters:
@@ -181,8 +170,7 @@ def round_outwards(value: float, sign: int) -> float:
     place = 2 - math.floor(math.log10(abs(value)))
     # Values of so few digits stay, whatever their last bits are.
     scaled = round(value * 10.0**place, 6)
-    whole = math.ceil(scaled) if sign > 0 else math.floor(scaled)
-    return float(f"{whole}e{-place}")
+    return float(f"{math.ceil(scaled) if sign > 0 else math.floor(scaled)}e{-place}")
 
 
 def describe_changes(changes: Sequence[Change]) -> str:
@@ -267,18 +255,24 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     Torque rate limits, or else limits of which the least violation is found with soft ones.
     `stopped` says in words how the solver ended.
     """
-    parts = PathIterate.begin(task, task.elements).parts
+    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
     if task.is_held:
         return _explain_rate_limits(task, parts, stopped)
-    data, scales = join(parts), task.curves[0].formation.scene.scales
+    data, torque = join(parts), task.curves[0].formation.scene.scales.torque
     profile, units = guess_slowly(data)
-    units = units._replace(torque=np.full(2, 15.0 * scales.torque))  # as bad as one of force
+    units = units._replace(torque=np.full(2, 15.0 * torque))  # as bad as one of force
     short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
     short += 0.05 * data.limits.scales
-    soft_solution = _solve_soft(data, profile, units, short / units.of(data.limits), None)
-    if soft_solution is None:
+    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, Objective.ELASTIC)
+    result = nlp.solver(
+        x0=pack(nlp, profile, units, short / units.of(data.limits)),
+        p=parameters(nlp, data, units, 1.0),
+        **make_bounds(nlp, data, units, Tightening.none(data, None)),
+    )
+    if not nlp.solver.stats()["success"]:
         return SolverError(stopped)
-    elastic, motions, torques = soft_solution[0], list[PathMotion](), list[TorqueProfile]()
+    elastic, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+    motions, torques = list[PathMotion](), list[TorqueProfile]()
     shortfalls, missing = list[Shortfall](), None
     for part, part_profile, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
         motions.append(PathMotion(part.curve, part.grid, part_profile))
@@ -293,11 +287,6 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
-    # In units of a slow motion, or of an absurd epsilon, the regularization would outweigh what is
-    # relaxed: units of a fall, and of forces that a hand may have.
-    fall = float(np.sqrt(float(data.grid.s[-1]) / scales.acceleration))
-    largest = 5.0 * scales.force  # largest unit of force when a limit is relaxed, over the scene's
-    units = units._replace(time=min(units.time, fall), force=min(units.force, largest))
     may_change = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:
         # Velocities after impacts between phases would depend on friction too.
@@ -306,10 +295,8 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     def list_values(parameter: Parameter) -> Sequence[float]:
         if parameter.key.startswith(FRICTION):
             return list_frictions_to_try(parameter)
-        step = units.force if parameter.unit == "N" else parameter.value
-        relaxation = Relaxation(parameter, step)
-        solution = _solve_soft(data, elastic, units, 1.0, relaxation)
-        return list_beyond(parameter, relaxation.move(solution[1])) if solution else ()
+        least = _find_least(task, parameter)
+        return () if least is None else list_beyond(parameter, least)
 
     with suppress(SolverError):  # it stalls
         torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
@@ -319,33 +306,35 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     return explain(task.phases, shortfalls, missing, may_change, list_values, replan)
 
 
-def _solve_soft(
-    data: PhaseData,
-    profile: Profile,
-    units: Units,
-    extra: float | Array,
-    relaxation: Relaxation | None,
-) -> tuple[Profile, float] | None:
-    """Solve with soft limits, from a profile and the relaxation `extra` there."""
-    goal = Objective.RELAX if relaxation else Objective.ELASTIC
-    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, goal)
-    result = nlp.solver(
-        x0=pack(nlp, profile, units, extra),
-        p=parameters(nlp, data, units, 1.0, relaxation),
-        **make_bounds(nlp, data, units, Tightening.none(data, None), relaxation),
-    )
-    if not nlp.solver.stats()["success"]:
+def _change_task(task: Task, parameter: Parameter, value: float) -> Task:
+    """Planning along the same curves with another value of a parameter."""
+    if parameter.key == EPSILON:
+        return replace(task, epsilon=value)
+    return replace(task, curves=[change_curve(c, parameter.key, value) for c in task.curves])
+
+
+def _find_least(task: Task, parameter: Parameter) -> float | None:
+    """The value of a parameter next to its own with which a speed sweep finds a motion, to 0.3 %.
+
+    By bisection, up to a thousand times its own or down to zero; None if there is none.
+    """
+    rises = parameter.sign > 0
+    failed, least = parameter.value, 1e3 * parameter.value if rises else 0.0
+    if _change_task(task, parameter, least).find_fastest() is None:
         return None
-    return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+    while abs(least - failed) > 0.003 * max(least, 0.01 * failed):
+        middle = math.sqrt(failed * least) if rises else (failed + least) / 2
+        enough = _change_task(task, parameter, middle).find_fastest() is not None
+        least, failed = (middle, failed) if enough else (least, middle)
+    return least
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
     """Plan along the same curves with another value of a parameter, roughly."""
-    if parameter.key == EPSILON:
-        task = replace(task, epsilon=value)
-    else:
-        task = replace(task, curves=[change_curve(c, parameter.key, value) for c in task.curves])
-    return plan_task(replace(task, options=task.options.roughen()), insist=False)
+    task = _change_task(task, parameter, value)
+    if task.find_fastest() is None:
+        raise SolverError("no motion keeps the limits")
+    return plan_task(replace(task, options=task.options.roughen()))
 
 
 def list_frictions(formation: Formation) -> list[Parameter]:
@@ -501,12 +490,9 @@ def refuse(
 def require_hold_at_ends(
     problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage]
 ) -> None:
-    """Require torques that hold the object at rest at both ends of phases, as torques may not step.
+    """Raise an InfeasibleError if no torques hold the object at rest at both ends of phases.
 
-    Raises
-    ------
-    InfeasibleError  if there are none; the end counts if it is one point, and has to be reached by
-        torques that hold it
+    Torques may not step. The end counts if it is one point; it has to be reached by such torques.
     """
     ends = [(phases[0], to_si(stages[0], problem), 0)]
     if stages[-1].formation.n_constraints == 4 or phases[-1].until.pins:
@@ -542,8 +528,7 @@ def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) 
     limits = make_limits(phase.formation, problem.epsilon).limits
     limit = next(limit for limit in limits if (limit.kind, limit.part) == best[1:3])
     place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
-    amount = missed * limit.scale
-    shortfall = Shortfall(*best[1:3], limit.text, amount, limit.unit, place, missed)
+    shortfall = Shortfall(*best[1:3], limit.text, missed * limit.scale, limit.unit, place, missed)
     raise InfeasibleError(
         f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
         f"{shortfall}",

@@ -111,8 +111,7 @@ def find_limits(
     curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
 ) -> PathLimits:
     """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
-    directions = directions_of(curve, segment)
-    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    forces = inverse(curve.formation, *point[:3], directions_of(curve, segment), point.kinematics)
     limits = make_limits(curve.formation, epsilon)
     return PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
 
@@ -124,28 +123,16 @@ class LowerBound(NamedTuple):
     error: float  # [s]: that estimate, by quadratures of two orders
 
 
-class _Round(NamedTuple):
-    """The bound on a grid, the loss in each interval, (N,) [s], and the profile it is from."""
-
-    bound: LowerBound
-    losses: Array
-    motion: SpeedProfile
-    time: float
-
-
 def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | None:
     """Lower bound of the time along curves; None where no motion is found.
 
-    Parameters
-    ----------
-    curves         with speed ratios that make the speed continuous where two of them meet
-    epsilon : [N]  least normal force
+    Curves have speed ratios that make the speed continuous where two of them meet.
     """
     path = PathTerms(curves, epsilon)
-    grid, b_guess, result, tries = path.make_grid(GRID_INTERVALS), None, None, 0
+    grid, b_guess, bound, tries = path.make_grid(GRID_INTERVALS), None, None, 0
     for _ in range(16):  # most grids; losses fall by 64 a grid where speeds are very low
         try:
-            result = _bound(path, grid, b_guess)
+            bound, losses, motion, time = _bound(path, grid, b_guess)
         except NoMotionError as error:
             tries += 1
             if tries > _TRIES:
@@ -154,7 +141,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
             parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
             grid, b_guess = grid.split(parts), None
             continue
-        share = result.losses / (3e-8 * result.time)  # relative tolerance
+        share = losses / (3e-8 * time)  # relative tolerance
         # Losses at switches and kinks fall with the square or the third power of the interval.
         parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)
         # If not all can be split, those that lose most are.
@@ -166,16 +153,16 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
             break
         finer = grid.split(parts)
         middles = (finer.angles[1:] + finer.angles[:-1]) / 2
-        b_guess = np.interp(path.place(middles), path.place(grid.angles), result.motion.b)
+        b_guess = np.interp(path.place(middles), path.place(grid.angles), motion.b)
         grid = finer
-    return result and result.bound
+    return bound
 
 
 def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
     """Lower bound on one coarse grid; see `bound_least_time`. Zero where no motion is found."""
     path = PathTerms(curves, epsilon)
     try:
-        return _bound(path, path.make_grid(intervals), None).bound.value
+        return _bound(path, path.make_grid(intervals), None)[0].value
     except NoMotionError:
         return 0.0
 
@@ -183,11 +170,7 @@ def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> fl
 def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
     """Estimated least time along curves from rest to rest [s]; see `bound_least_time`.
 
-    Limits are kept at one place of each interval of a coarse grid.
-
-    Raises
-    ------
-    NoMotionError  if there is no motion on that grid
+    Limits are kept at one place of each interval of a coarse grid. NoMotionError without a motion.
     """
     path = PathTerms(curves, epsilon)
     grid = path.make_grid(intervals)
@@ -201,8 +184,13 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     return float(find_duration(motion.b, steps))
 
 
-def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
-    """The bound on a grid; viscous friction is linearised about b = `b_guess` in its intervals."""
+def _bound(
+    path: PathTerms, grid: PathGrid, b_guess: Array | None
+) -> tuple[LowerBound, Array, SpeedProfile, float]:
+    """The bound on a grid, losses in its intervals, (N,) [s], the profile it is from, and its time.
+
+    Viscous friction is linearised about b = `b_guess` in the intervals.
+    """
     h = np.diff(grid.angles)[:, None]
     angles = grid.angles[:-1, None] + _PLACES * h
     rows = path.evaluate(angles, grid.owners)
@@ -240,9 +228,8 @@ def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
     total = float(fine.sum() + jumps @ taken)
     estimate = 2.0 * float(error.sum())  # both quadratures err alike at switches
     value = max(0.0, total - estimate) if np.isfinite(total) else 0.0
-    return _Round(
-        LowerBound(value, estimate), losses, motion, float(find_duration(motion.b, np.diff(s)))
-    )
+    time = float(find_duration(motion.b, np.diff(s)))
+    return LowerBound(value, estimate), losses, motion, time
 
 
 class Costate(NamedTuple):
@@ -344,8 +331,7 @@ def _find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
         c, g = share * rows[..., B] - slope[:, None], share * rows[..., V]
         least = _minimise(c, g, cap) + share * rows[..., ONE]
     least = np.where((share < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
-    alone = _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0]
-    return np.where(p == 0, alone, least)
+    return np.where(p == 0, _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0], least)
 
 
 def evaluate(rows: PathLimits, p: Array, slope: Array, b: Array) -> Array:

@@ -343,9 +343,7 @@ class Solver:
     def __call__(self, **arguments: Any) -> dict[str, Expression]:
         """Solve; inputs and outputs are those of a CasADi NLP solver.
 
-        Raises
-        ------
-        KeyboardInterrupt  if a signal stopped the solver, or the time is over (`OutOfTime`)
+        KeyboardInterrupt if a signal stopped the solver, or the time is over (`OutOfTime`).
         """
         beat()
         # CasADi takes lists in three times as fast as arrays.

@@ -78,8 +78,7 @@ def solve(
         in its replay; names phase, limit, place and time. A SolverError says what was being done
         when the time was over.
     """
-    plan_options = PlanOptions(objective=objective, **options)
-    return solve_with(problem, plan_options, progress, time_limit)
+    return solve_with(problem, PlanOptions(objective=objective, **options), progress, time_limit)
 
 
 @exclusive
@@ -341,8 +340,7 @@ def _find_widest(
 
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > 0.01 * high):  # relatively
-        options = scale(middle)
-        task = Task(curves, problem.epsilon, options, numbers, None, guides=tuple(guides))
+        task = Task(curves, problem.epsilon, scale(middle), numbers, None, guides=tuple(guides))
         fastest = task.find_fastest()
         if fastest is None:
             high = middle

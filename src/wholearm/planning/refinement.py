@@ -45,10 +45,7 @@ I = TypeVar("I", bound=Iterate)  # noqa: E741
 def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
     """The solution without violations whose estimated error is below the accuracy, or least.
 
-    Raises
-    ------
-    SolverError  if no solution keeps the limits between nodes; it is that of the first mesh, or a
-                 CostlyError
+    The SolverError if none keeps the limits between nodes is that of the first mesh, or costly.
     """
     iterate: I | None = first
     best: I | None = None

@@ -238,8 +238,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
     ReplayError                    if the replay loses a contact or misses the goal with any rows
     JammingError, SimulationError  if the simulation cannot go on
     """
-    slow = problem.scene.has_slow_motors
-    rate_limit = problem.scene.torque_rate_limit if slow else None
+    rate_limit = problem.scene.torque_rate_limit if problem.scene.has_slow_motors else None
     least, error = ERROR / _FINER ** (_ATTEMPTS - 1), ERROR
     rows = place_rows(trajectory.torque, error, rate_limit)
     # Commands step where the slopes of lines do, so that motors' limits need no replay.
@@ -275,8 +274,7 @@ def sample_table(
     if replay:
         try:
             seen = observe(problem, read_rows(rows), trajectory)
-            report = judge(seen._replace(plan=None), Allowance())
-            compared = _compare(trajectory, report)
+            compared = _compare(trajectory, judge(seen._replace(plan=None), Allowance()))
         except (JammingError, SimulationError) as error:
             compared = {"ok": False, "reason": str(error), "phases": []}
     sampling = {"sample_rate": rate, "interpolation": interpolation}
@@ -289,13 +287,12 @@ def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
     for index in range(len(trajectory.motions)):
         phase = report.phases[index] if index < len(report.phases) else None
         least = find_least_force(phase) if phase else None
-        planned = trajectory.c_n[trajectory.phase == index]
         phases.append(
             {
                 "phase": index + 1,
                 "planned_arrival": float(trajectory.phase_starts[index + 1]),
                 "arrival": phase.arrival if phase else None,
-                "planned_least_c_n": float(np.nanmin(planned)),
+                "planned_least_c_n": float(np.nanmin(trajectory.c_n[trajectory.phase == index])),
                 "least_c_n": least.least if least else None,
                 "contact": least.contact if least else None,
             }

@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
-from ...common.errors import InputError, JammingError, Parameter, SolverError
+from ...common.errors import InputError, JammingError, SolverError
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
@@ -105,12 +105,9 @@ class PhaseData(NamedTuple):
         values[:, self.limits.of(PRESS)] -= margin
         return self.limits.find_slack(values)
 
-    def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
-        """Largest b by the joints' speed limits but a `spared` one, shape (n,) [m^2/s^2]."""
-        kept = [
-            each for each in self.speeds.limits if not spared or each.parameter.key != spared.key
-        ]
-        return find_speed_cap(LimitSet(tuple(kept)), places.rates)
+    def largest_b(self, places: Places) -> Array:
+        """Largest b by the joints' speed limits, shape (n,) [m^2/s^2]."""
+        return find_speed_cap(self.speeds, places.rates)
 
     def interpolate(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
@@ -140,11 +137,7 @@ class PhaseData(NamedTuple):
 
 
 def prepare(
-    curve: Curve,
-    epsilon: float,
-    grid: Grid,
-    phase: int,
-    spread: RobustLimits | None = None,
+    curve: Curve, epsilon: float, grid: Grid, phase: int, spread: RobustLimits | None = None
 ) -> PhaseData:
     """Evaluate inverse dynamics and limits, with a `spread` robust ones, along a curve.
 
@@ -178,8 +171,7 @@ def prepare(
         variations = spread.find_variations(formation, point, directions, forces, epsilon)
     every = Places(forces, point.z_s[:, 3:], variations)
     added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
-    order = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1])
-    knots = every.pick(order.ravel())
+    knots = every.pick(np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel())
 
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
     to_checks, to_knots = (
@@ -190,8 +182,7 @@ def prepare(
 
     def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
-        count = len(nonempty) * len(sampling.checks)
-        return (through @ table).reshape(count, *values.shape[1:])
+        return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
     nodes, checks = every.pick(slice(None, len(grid.s))), knots.map(interpolate)
     limits = make_limits(formation, epsilon)
@@ -199,8 +190,7 @@ def prepare(
         from ..robust.robust_rows import spread_limits
 
         limits = spread_limits(limits)
-        steps = sampling.checks * grid.steps[nonempty, None]
-        inside = (grid.s[nonempty, None] + steps).ravel()
+        inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
         nodes, checks = (
             each._replace(
@@ -269,10 +259,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
 
     Through the knots, or through Chebyshev points in time if that misses the torque between them.
-
-    Raises
-    ------
-    SolverError  if the motion all but stops in an interval
+    SolverError if the motion all but stops in an interval.
     """
     k, (knots, checks) = data.grid.nonempty, data.sampling
     spans = motion.durations(knots)

@@ -202,8 +202,7 @@ class _Looks(NamedTuple):
         changes = np.flatnonzero(label[1:] != label[:-1])
         if not len(changes):
             return switches
-        apart = np.diff(self.s[changes]) > flicker
-        for cluster in np.split(changes, np.flatnonzero(apart) + 1):
+        for cluster in np.split(changes, np.flatnonzero(np.diff(self.s[changes]) > flicker) + 1):
             first, last = int(cluster[0]), int(cluster[-1]) + 1
             if label[first] == label[last]:
                 continue
@@ -324,8 +323,7 @@ def equidistribute(part: PhaseData, motion: PathMotion, costs: Array, elements: 
     ends = motion.times.reshape(-1, NODES)
     spans = ends[:, -1] - ends[:, 0]
     density = np.sqrt(variation * spans)
-    dear = np.cbrt(costs.reshape(len(spans), -1).sum(axis=1))
-    parts = density, spans, dear
+    parts = density, spans, np.cbrt(costs.reshape(len(spans), -1).sum(axis=1))
     shares = np.sum([part / max(part.sum(), 1e-300) for part in parts], axis=0)
     done, t = np.append(0.0, np.cumsum(shares)), np.append(ends[:, 0], ends[-1, -1])
     stops = part.grid.edges[:, 1]

@@ -57,8 +57,7 @@ def find_basis() -> Basis:
     cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
     rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
-    vandermonde = legendre.legvander(2 * x - 1, DEGREE)
-    modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
+    modes = np.asarray(np.linalg.inv(legendre.legvander(2 * x - 1, DEGREE)), dtype=float)
     return Basis(y, to_powers, rises @ to_powers, weights, modes)
 
 
@@ -190,12 +189,7 @@ def follow(grid: Grid, a: Array, lam: Array) -> Profile:
 
 
 class Elements:
-    """The polynomials of a profile on a grid.
-
-    Parameters
-    ----------
-    profile  at its nodes
-    """
+    """The polynomials of a profile at the nodes of a grid."""
 
     def __init__(self, grid: Grid, profile: Profile) -> None:
         self.grid = grid
@@ -405,8 +399,7 @@ class PathMotion:
             part = (y_cubic**3 - start**3) / ((start + rise) ** 3 - start**3)
             done, y = np.where(cubic, part, done), np.where(cubic, y_cubic, y)
         here, _ = self.elements.evaluate(k, y)
-        s = self.grid.s[k] + done * self.grid.steps[k]
-        return s, self.grid.segment[k], here
+        return self.grid.s[k] + done * self.grid.steps[k], self.grid.segment[k], here
 
     @property
     def spans(self) -> list[tuple[float, float, Directions]]:

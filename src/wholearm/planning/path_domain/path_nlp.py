@@ -10,8 +10,8 @@ viscous friction (`PathForces`). Unknowns are a_k, b_k and lambda_k at the nodes
 
 b is continuous where two elements meet; a and lambda may step. Rate-limited torques are continuous:
 d tau / dt = (d tau / dy) (dy / dt) with the local variable y of an element, in which the torques at
-its nodes are a polynomial. The least margin, and the relaxation of a limit, have a copy at every
-node with m_k+1 = m_k: a dense column would make building the Jacobian quadratic in their number.
+its nodes are a polynomial. The least margin has a copy at every node with m_k+1 = m_k: a dense
+column would make building the Jacobian quadratic in their number.
 Built once for some contacts, intervals and an objective, it serves every phase: grid, coefficients
 and limits are its parameters and bounds.
 
@@ -34,7 +34,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...common.errors import Parameter
 from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.path_limits import PathLimits
@@ -60,8 +59,6 @@ from .path_motion import (
     follow,
 )
 
-CHAINED = (Objective.MARGIN, Objective.RELAX)  # with one more unknown, copied at every node
-SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the soft limits
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
@@ -141,8 +138,7 @@ def _find_paces(
 
 def _find_bends(values: Expression, degree: int) -> Expression:
     """Sum of the squared Legendre coefficients of each element from a degree on, shape (1, E)."""
-    modes = ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, NODES, -1)
-    return ca.sum1(modes**2)
+    return ca.sum1((ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, NODES, -1)) ** 2)
 
 
 def list_kinds(count: int, held: bool) -> list[int]:
@@ -189,20 +185,6 @@ class Units(NamedTuple):
         return np.where(of_torque.any(axis=1), of_torque @ self.torque, self.force)
 
 
-class Relaxation(NamedTuple):
-    """The relaxed parameter, and its change per unit relaxation of the NLP."""
-
-    parameter: Parameter
-    step: float  # in its unit; that of a speed is of its square, relatively
-
-    def move(self, relaxed: float) -> float:
-        """The parameter when relaxed so far."""
-        value, sign = self.parameter.value, self.parameter.sign
-        if self.parameter.is_speed:
-            return float(value * (1 + relaxed) ** 0.5)
-        return float(value + sign * self.step * relaxed)
-
-
 class SureStart(NamedTuple):
     """Bounds of the first node: s'' from `least_a` up, internal force from `low` to `high`."""
 
@@ -239,15 +221,15 @@ class PathNLP:
     intervals: int
     objective: Objective
     # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
-    # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
+    # shortfalls for `elastic`, or the least margin
     node: Columns
     # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limits at the nodes, column by column (the constant ones are part of the
-    # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
-    # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
+    # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, bends of
+    # elements and `sizes` of b for rate limits
     p: Columns
-    # b' = 2 a; the `chain` of the margin or the relaxation; node by node the `limits`, side by side
-    # where they are soft, and the speed for `relax`; the `duration` for `margin`; rate limits
+    # b' = 2 a; the `chain` of the margin; node by node the `limits`, side by side where they are
+    # soft; the `duration` for `margin`; rate limits
     g: Columns
 
     @cached_property
@@ -263,23 +245,21 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     """Build the NLP for every phase with limits of a shape."""
     started = time.perf_counter()
     n, m, slow = intervals + 1, shape.rows, shape.slow
-    effort, relax = objective is Objective.EFFORT, objective is Objective.RELAX
-    chained, late = objective in CHAINED, objective is Objective.MARGIN
+    effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
+    soft = objective is Objective.ELASTIC
     sizes = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
     sizes |= {"lam": n * m, "speed": n * len(shape.fast)}
     if effort or slow:
         sizes |= {"torque": n * 2}
     if effort:
         sizes |= {"joints": 2}
-    elif relax:
-        sizes |= {"gives": m + 1, "rates": n}
     if slow:
         sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
         sizes |= {"bends": n // NODES, "sizes": n}
     p = Columns(**sizes)
     symbols = p.make_symbols()
     b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
-    extra = ca.SX.sym("extra", n, m if objective is Objective.ELASTIC else int(chained))
+    extra = ca.SX.sym("extra", n, m if soft else int(late))
     h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
     bends, scales = (symbols.bends.T, symbols.sizes) if slow else (None, ca.DM.ones(n))
@@ -299,43 +279,36 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     torques = values[:, list(shape.torques)]
     if effort or slow:
         torques += ca.reshape(symbols.torque, n, 2)
-    # The relaxation has to outweigh the regularization.
-    share = 1e-3 if relax else 1.0
     scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * 1e-6 * node_weights * scaled_lam**2  # among equal plans
+    node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
     rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
-    if objective is Objective.ELASTIC:
+    if soft:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
         first, second = _find_bends(a, 1), _find_bends(a, 2)
         rough += 1e3 * ca.horzcat(first[0], second[1:-1], first[-1])
         node_costs[:-1] += 1e-4 * (a[1:] - a[:-1]) ** 2
-    node_costs[0] += share * 0.1 * ca.sum2(lengths * rough)  # no oscillation within elements
+    node_costs[0] += 0.1 * ca.sum2(lengths * rough)  # no oscillation within elements
     if objective is Objective.TIME:
         node_costs += times
     elif effort:
         node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
     elif late:
         node_costs[0] -= extra[0]
-    elif objective is Objective.ELASTIC:
+    else:
         # Not weighted by lengths, or shortfalls at short intervals would be cheap.
         node_costs += ca.sum2(extra) / n + 1e-4 * times
-    else:
-        node_costs[0] += extra[0]
-        node_costs += 1e-5 * times
 
-    # Limits at the nodes, side by side where they are soft, and one of the speed to relax.
+    # Limits at the nodes, side by side where they are soft.
     limits = values
     if late:
-        raised = np.isin(np.arange(m), shape.presses).astype(float)
-        limits = values - extra @ ca.DM(raised).T
-    elif objective in SOFT:
-        short = extra @ symbols.gives.T if relax else extra
-        sides = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
-        limits = ca.horzcat(*sides, *([symbols.rates * b - short[:, m]] if relax else []))
+        limits = values - extra @ ca.DM(np.isin(np.arange(m), shape.presses).astype(float)).T
+    elif soft:
+        sides = [values[:, row] + sign * extra[:, row] for row, sign in shape.sides]
+        limits = ca.horzcat(*sides)
     none = ca.SX(0, 1)
     rows = {
         "links": (b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
-        "chain": extra[1:] - extra[:-1] if chained else none,
+        "chain": extra[1:] - extra[:-1] if late else none,
         "limits": ca.vec(limits.T),
         "duration": ca.sum1(times) if late else none,
     }
@@ -362,16 +335,14 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     book(SolverStatistics(build_time=time.perf_counter() - started))
     # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
-    strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
+    strategy = {"mu_strategy": "monotone"} if soft else {"mu_oracle": "probing"}
     if slow:
-        # Large gradients of the time next to rest would scale the objective down.
-        strategy |= {"nlp_scaling_method": "none"}
-    if slow and objective not in SOFT:
-        # Probing lowers the barrier at once, and steps along the bounds of rates are short then.
-        strategy |= {"mu_oracle": "quality-function"}
+        # Large gradients of the time next to rest would scale the objective down. Probing lowers
+        # the barrier at once, and steps along the bounds of rates are short then.
+        strategy = {"nlp_scaling_method": "none", "mu_oracle": "quality-function"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     starter = solver
-    if slow and objective not in SOFT:
+    if slow:
         derived = {"jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l", "grad_f": "nlp_grad_f"}
         same = {key: solver.function.get_function(name) for key, name in derived.items()}
         starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
@@ -379,13 +350,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
 
 
-def parameters(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    time_weight: float,
-    relaxation: Relaxation | None = None,
-) -> Array:
+def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) -> Array:
     """Parameters of the NLP, in its units."""
     terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
     blocks = {
@@ -404,16 +369,6 @@ def parameters(
         blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
         blocks["lags"] = scene.actuator_lag[commands] / units.time
         blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
-    if relaxation is not None:
-        parameter, step = relaxation
-        gives = data.limits.weigh(parameter) * step / unit
-        blocks["gives"] = np.append(gives, parameter.is_speed)
-        # Rate of the joint over its speed limit; zero for another parameter.
-        share = np.zeros(len(data.grid.s))
-        for limit in data.speeds.limits:
-            if limit.parameter.key == parameter.key:
-                share = data.nodes.rates @ limit.rows[0, -2:] / limit.high[0]
-        blocks["rates"] = share**2 * b_unit
     return np.asarray(
         nlp.p.join(
             ends=np.zeros(2),
@@ -430,7 +385,6 @@ def make_bounds(
     data: PhaseData,
     units: Units,
     tightening: Tightening,
-    relaxation: Relaxation | None = None,
     start: SureStart | None = None,
     pins: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Array]:
@@ -438,7 +392,7 @@ def make_bounds(
     tight, speed_share, duration, *_ = tightening
     n, node = len(data.grid.s), nlp.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
-    b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
+    b_max = data.largest_b(data.nodes)
     # Next to rest b is 2 s times the least s''.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
@@ -461,13 +415,11 @@ def make_bounds(
     rows, signs, bounds = data.limits.sides
     sides = bounds + signs * tight - data.find_terms()[:, rows, ONE]
     sides /= units.of(data.limits)[rows]
-    side = np.arange(len(rows)) if nlp.objective in SOFT else rows
+    side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
     width = nlp.g.sizes["limits"] // n
     rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
     rows_low[:, side[signs > 0]] = sides[:, signs > 0]
     rows_high[:, side[signs < 0]] = sides[:, signs < 0]
-    if nlp.objective is Objective.RELAX:
-        rows_high[:, -1] = 1.0
     late = nlp.g.sizes["duration"]
     equal = np.zeros(nlp.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
@@ -487,37 +439,30 @@ def make_bounds(
 
 
 def pack(
-    nlp: PathNLP,
-    profile: Profile,
-    units: Units,
-    extra: float | Array,
-    sizes: Array | float = 1.0,
+    nlp: PathNLP, profile: Profile, units: Units, extra: float | Array, sizes: Array | float = 1.0
 ) -> Array:
     """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
 
-    `extra` is the least margin [N], the relaxation, or shortfalls in the units of the limits.
+    `extra` is the least margin [N], or shortfalls in the units of the limits.
     """
     table = np.empty(nlp.free.shape)
-    table[:, nlp.node["extra"]] = extra / _margin_unit(nlp, units)
+    unit = units.force if nlp.objective is Objective.MARGIN else 1.0
+    table[:, nlp.node["extra"]] = extra / unit
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
     table[:, 0] /= sizes
     return np.asarray(table[nlp.free])
 
 
-def _margin_unit(nlp: PathNLP, units: Units) -> float:
-    return units.force if nlp.objective is Objective.MARGIN else 1.0
-
-
 def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N] or the relaxation, if any.
+    """Profile of a solution, and the least margin [N], if any.
 
     b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
     """
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
     a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
-    return follow(grid, a, lam), float(margin)
+    margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
+    return follow(grid, a, lam), margin
 
 
 _SLOW = -12  # height of the slowest guess over that of a fall, as a power of two

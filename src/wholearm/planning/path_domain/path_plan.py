@@ -23,7 +23,7 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
 from ...mechanics.limits import PRESS
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
-from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
+from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
 from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
@@ -69,11 +69,7 @@ WORTH = 0.02  # largest relative cost of such a start
 
 
 def plan_path(
-    curve: Curve,
-    epsilon: float,
-    options: PlanOptions,
-    phase: int,
-    duration: float | None = None,
+    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None = None
 ) -> PhasePlan[PathMotion]:
     """Plan one phase along a curve, from rest to rest; see `plan_curves`."""
     return plan_curves((curve,), epsilon, options, (phase,), duration)[0]
@@ -148,22 +144,12 @@ def plan_curves(
     return iterate.plans if surely else _leave_rest(iterate)
 
 
-def plan_task(task: Task, insist: bool = True) -> PathIterate:
-    """Solve and refine; unless to `insist`, only where a sweep or a guess shows a motion."""
+def plan_task(task: Task) -> PathIterate:
+    """Solve and refine."""
     for curve, phase in zip(task.curves, task.phases, strict=True):
         require_unique(curve, task.options.uniqueness_margin, phase)
     first = PathIterate.begin(task, min(task.elements, _START) if task.is_held else task.elements)
-    if not insist and not first.is_kept:
-        raise SolverError("no motion keeps the limits")
-    accuracy = task.options.accuracy
-    iterate = refine(first, accuracy)
-    while iterate.error > accuracy and accuracy < DEFAULT_ACCURACY:
-        # Where an accuracy is not reached, a plan for a larger one may be better.
-        accuracy *= 10
-        options = replace(task.options, accuracy=accuracy)
-        other = refine(replace(first, task=replace(task, options=options)), accuracy)
-        iterate = min(iterate, other, key=lambda candidate: candidate.objective)
-    return iterate
+    return refine(first, task.options.accuracy)
 
 
 def _plan_within(task: Task) -> PathIterate:
@@ -327,16 +313,9 @@ class Task:
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
-    """Require unique contact forces along a curve.
+    """Raise an AmbiguityError if a uniqueness margin along the curve of a phase is below `least`.
 
-    Parameters
-    ----------
-    least  least uniqueness margin (`mechanics.uniqueness`)
-    phase  its number, for messages
-
-    Raises
-    ------
-    AmbiguityError  if one is less; where friction jams the curve, `path_data.prepare` raises
+    Where friction jams the curve, `path_data.prepare` raises.
     """
     formation, segments = curve.formation, curve.segments
     if not formation.friction.any():
@@ -378,7 +357,6 @@ class PathIterate:
     units: Units
     solution: PathSolution
     tightening: Tightening  # of the limits for that
-    is_kept: bool  # whether some motion is known to keep limits, or negative margins would do
     meshes: int = 0  # before this one
     before: PathIterate | None = None  # the solution on the mesh before
 
@@ -392,9 +370,7 @@ class PathIterate:
         if goal is Objective.TIME and not task.is_held:
             fastest = find_fastest(data)
         if fastest is None:
-            kept = goal is Objective.MARGIN or bool(data.slack(data.nodes, profile).min() >= 0)
-            first = PathIterate.on(task, (none, none), parts, units, kept)
-            return first.start(profile, 0.0)
+            return PathIterate.on(task, (none, none), parts, units).start(profile, 0.0)
         # Breaks at the switches, but on a curve where a fixed number of elements is too few.
         starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
         places = np.array([switch.place for switch in fastest.switches])
@@ -405,7 +381,7 @@ class PathIterate:
             few = task.options.intervals and len(find_ends(curve, curve_breaks)) > elements
             breaks.append(curve_breaks[:0] if few else curve_breaks)
         parts = task.lay_out(breaks, elements)
-        first = PathIterate.on(task, (breaks, none), parts, units, True)
+        first = PathIterate.on(task, (breaks, none), parts, units)
         profile, multipliers = start_at(first.nlp, first.data, units, fastest)
         return replace(first, solution=PathSolution(profile, 0.0, multipliers))
 
@@ -415,7 +391,6 @@ class PathIterate:
         edges: tuple[Sequence[Array], Sequence[Array]],
         parts: list[PhaseData],
         units: Units,
-        kept: bool,
     ) -> PathIterate:
         """The NLP on elements with these breaks and cuts, without a point to start from."""
         data, (breaks, cuts) = join(parts), map(tuple, edges)
@@ -423,7 +398,7 @@ class PathIterate:
         zero = np.zeros_like(data.grid.s)
         first = PathSolution(Profile(zero, zero, zero), 0.0, {})
         none = Tightening.none(data, task.duration)
-        return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none, kept)
+        return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none)
 
     def start(self, profile: Profile, margin: float) -> PathIterate:
         """The same near a motion and its margin [N], with multipliers near the central path."""
@@ -467,10 +442,14 @@ class PathIterate:
         again = self.meshes < 6  # most meshes whose breaks move
         # A first plan that misses much by signs of no row is a reference only; case: two releases
         # of a pentagon, whose plan takes 20 % longer.
-        if task.guides and again and self.violation_at_nodes > 0.05:
+        slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
+        if task.guides and again and (slack / self.data.spans).min() < -0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
-        costs = self.due + self.paid
+        # What tightening by the violations will cost, and what it has.
+        (short, speeding), hurry, _ = self.misses
+        due = self._price(*map(self.data.spread_to_nodes, (short, speeding, hurry)))
+        costs = due + self.paid
         shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
         costly = _GAP * float(costs.sum()) > accuracy
         if task.is_held and (self.meshes < 2 or (costly and self.meshes < 4)):
@@ -481,8 +460,7 @@ class PathIterate:
         if not task.is_held and (self.meshes == 0 or costly) and self.meshes < SOLVES:
             # Neither least effort nor tightened limits show where the switches are.
             breaks, shift = self.breaks, 0.0
-            tight = bool(self.tightening.missed.any())
-            if not (task.options.goal is Objective.EFFORT or tight):
+            if not (task.options.goal is Objective.EFFORT or bool(self.tightening.missed.any())):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
                 matches = [
                     match(before, find_switches(part, motion.profile, margin), part.curve)
@@ -495,8 +473,7 @@ class PathIterate:
             edges = [part.grid.edges for part in self.parts]
             count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
             if costly and task.options.intervals is None and 2 * count >= task.elements:
-                pairs = zip(edges, shares, strict=True)
-                halved = [halve(*pair, count) for pair in pairs]
+                halved = [halve(*pair, count) for pair in zip(edges, shares, strict=True)]
                 return self._move(breaks, halved, task.elements)
         return self.tighten() if self.violation > 1 else None
 
@@ -510,7 +487,7 @@ class PathIterate:
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units, self.is_kept)
+        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units)
         made = replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
         return made.start(profile, old.margin)
 
@@ -578,13 +555,6 @@ class PathIterate:
         return float(max(max(over) / MISS, hurry.max() / 1e-4))  # rates relatively
 
     @property
-    def violation_at_nodes(self) -> float:
-        """Largest violation at nodes, over the scales: within ranges, by signs of no row."""
-        margin = self.solution.margin
-        slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
-        return -float((slack / self.data.spans).min())
-
-    @property
     def error(self) -> float:
         """Estimated relative error, by the cost of the tightening.
 
@@ -592,12 +562,6 @@ class PathIterate:
         where limits are tightened once; 1.5 times is within a factor of 3 either way.
         """
         return _GAP * float(self.paid.sum())
-
-    @cached_property
-    def due(self) -> Array:
-        """Relative cost at each node of tightening limits by their violations."""
-        (short, speeding), hurry, _ = self.misses
-        return self._price(*map(self.data.spread_to_nodes, (short, speeding, hurry)))
 
     @cached_property
     def paid(self) -> Array:

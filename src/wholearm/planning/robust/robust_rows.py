@@ -31,8 +31,7 @@ from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.sensitivity import find_force_slopes
 from ...mechanics.statics import Statics, TorquePolygon
-from ...problem.definition import PARAMETERS
-from ...scene.model import Friction
+from ...problem.definition import PARAMETERS, change_scene
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
 _LOOKS = 97  # places of a segment at which signs are found
@@ -113,8 +112,7 @@ def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
         return None
     part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
     count = formation.n_contacts
-    cones = (rows[:, count:] != 0).any(axis=1)
-    edges = np.where(cones[:, None], rows, 0.0)
+    edges = np.where((rows[:, count:] != 0).any(axis=1)[:, None], rows, 0.0)
     edges[:, count:] = 0.0
     edges[:, :count] *= [contact.finger == part for contact in formation.contacts]
     return edges
@@ -149,8 +147,7 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     names = [each.name for each in PARAMETERS if widths.get(each.name, 0.0) > 0]
     names = [name for name in names if name != "delay"]
     formation, segments = curve.formation, curve.segments
-    angles = np.linspace(0.0, np.pi, _LOOKS)
-    share = (1 - np.cos(angles)) / 2
+    share = (1 - np.cos(np.linspace(0.0, np.pi, _LOOKS))) / 2
     s = np.concatenate([part.start + share * (part.stop - part.start) for part in segments])
     segment = np.repeat(np.arange(len(segments)), _LOOKS)
     point = curve.evaluate(s)
@@ -210,12 +207,10 @@ def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> l
     """
     fingers = (ranges.get("gain1", 0.0), ranges.get("gain2", 0.0))
     gains = list(product(*(_spread(width) for width in fingers)))
-    scene, parts, holds = formation.scene, ("palm", "finger1", "finger2"), []
-    largest = {part: 1 + ranges.get(f"friction_{part}", 0.0) for part in parts}
-    friction = Friction(**{part: getattr(scene.friction, part) * largest[part] for part in parts})
+    largest, holds = {key: ranges[key] for key in ranges if key.startswith("friction")}, []
     for mass in _spread(ranges.get("mass", 0.0)):
-        polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
-        corner = replace(formation, scene=replace(scene, polygon=polygon, friction=friction))
+        scene = change_scene(formation.scene, largest | {"mass": mass - 1})
+        corner = replace(formation, scene=scene)
         static = Statics(corner, z).torque_polygon()
         holds += [(static, np.array(gain)) for gain in gains]
     return holds
