@@ -323,7 +323,7 @@ def simulate_body(
 ) -> FreeRun:
     """Let a system go without torques."""
     torque = TorqueProfile(np.array([0.0, until]), np.zeros((1, 2, 1)))
-    run = FreeRun(system, torque, np.array(z, float), np.array(v, float), restitution)
+    run = FreeRun(system, torque, np.array(z, float), np.array(v, float), restitution=restitution)
     run.play(1e-9 * system.scales.length)
     return run
 

@@ -46,7 +46,7 @@ from wholearm.planning.phase_plan import PhasePlan, end_of
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
-from wholearm.search.astar import FINEST, RefinedPath, ReleaseSearch, RouteSearch, bound_borders
+from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
 from wholearm.search.astar import Route as SearchRoute
 from wholearm.search.cuts import (
     describe_block,
@@ -69,7 +69,7 @@ from wholearm.search.edge_plans import (
 from wholearm.search.edges import Edge
 from wholearm.search.find_route import find_route, format_phases, load_roadmap, store_roadmap
 from wholearm.search.places import make_place, require_reach
-from wholearm.search.roadmap import Roadmap, can_start
+from wholearm.search.roadmap import Roadmap, evaluate_paths
 
 
 def read(goal: dict[str, Any], path: Path = HEPTAGON) -> Problem:
@@ -322,7 +322,7 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
             return None
         return CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
 
-    found, *others = ReleaseSearch(plan, CoarsePlan(1 + FINEST * abs(best), (), [])).run()
+    found, *others = search_release(plan, CoarsePlan(1 + FINEST * abs(best), (), []))
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
 
@@ -342,7 +342,7 @@ def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None
     for cost, duration in ((None, 1), (to_go, 4)):
         start = plan(RefinedPath(0))
         assert isinstance(start, CoarsePlan)
-        assert ReleaseSearch(plan, start, cost).run()[0].duration == duration
+        assert search_release(plan, start, cost)[0].duration == duration
 
 
 PHI = np.radians(-35.0)
@@ -635,9 +635,9 @@ def test_a_place_out_of_reach_changes_nothing_at_others() -> None:
     # A tip does not reach an edge that is 1 m away.
     lost = np.flatnonzero(np.isnan(place_at(scene, labels, far)).any(axis=1))[:1]
     assert len(lost)
-    alone = can_start(scene, 0.05, labels, poses, runs)
+    alone = evaluate_paths(scene, 0.05, labels, poses, runs).can_rest()
     assert 0.2 < alone.mean() < 0.8
     pairs = (labels, labels), (poses, far), (runs, runs)
     some, places, ways = (np.concatenate([part, own[lost]]) for part, own in pairs)
-    both = can_start(scene, 0.05, some, places, ways)
+    both = evaluate_paths(scene, 0.05, some, places, ways).can_rest()
     np.testing.assert_array_equal(both, [*alone, False])

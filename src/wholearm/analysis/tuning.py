@@ -14,13 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_root
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import takes_over
-from ..geometry.curve import find_root
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile, format_rows, read_rows

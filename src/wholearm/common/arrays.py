@@ -1,7 +1,9 @@
-"""Types of arrays and expressions; runs of flags, quadrature nodes, minima of samples."""
+"""Types of arrays and expressions; runs of flags, quadrature nodes, minima of samples, roots."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,3 +62,51 @@ def find_minima(values: Array) -> Array:
     inside = (here <= before) & (here <= after) & (bend > 0)
     dip = np.divide((after - before) ** 2, 8 * bend, out=np.zeros_like(here), where=inside)
     return np.asarray(np.minimum((here - dip).min(axis=1), values[:, [0, -1]].min(axis=1)))
+
+
+def find_root(
+    function: Callable[[float], float],
+    low: float,
+    high: float,
+    ends: tuple[float, float] | None = None,
+    near: float = 0.0,
+    flat: float = 0.0,
+) -> float:
+    """Root of a function in [low, high], whose values at the `ends` have opposite signs.
+
+    Regula falsi of Anderson and Bjorck until the bracket is as narrow as `near`, or as rounding, or
+    the function is within `flat`. After a step that has not halved the bracket the next one is that
+    of the square root of the function, which finds double roots, and after two the next one is a
+    bisection. Without a change of sign the result is `low`.
+    """
+    low, high = float(low), float(high)
+    f_low, f_high = ends or (function(low), function(high))
+    if f_high == 0 or f_low * f_high >= 0:
+        return low if f_high else high
+    near = max(near, 9e-16 * max(abs(low), abs(high)))
+    slow, width = -1, abs(high - low)
+    while abs(high - low) > near:
+        middle = high - f_high * (high - low) / (f_high - f_low)
+        slow = slow + 1 if 2 * abs(high - low) > width else 0
+        if not slow:
+            width = abs(high - low)
+        if slow == 1:
+            share = 1 / (1 + math.sqrt(-f_low / f_high))
+            middle = high - share * (high - low)
+        if slow > 1:
+            middle, slow, width = (low + high) / 2, 0, abs(high - low)
+        elif abs(middle - high) < near:
+            middle = high + math.copysign(near, low - high)
+        elif abs(middle - low) < near:
+            middle = low + math.copysign(near, high - low)
+        if middle in (low, high):
+            break
+        f_middle = function(middle)
+        if abs(f_middle) <= flat:
+            return middle
+        if f_middle * f_high < 0:
+            low, f_low = high, f_high
+        else:
+            f_low *= 1 - f_middle / f_high if abs(f_middle) < abs(f_high) else 0.5
+        high, f_high = middle, f_middle
+    return high

@@ -162,13 +162,13 @@ class Batch:
 
     Parameters
     ----------
-    function  inputs are column vectors, outputs dense
+    function  inputs are column vectors, outputs dense; it is kept
     """
 
     sizes = (1, 20, 64)  # points of a call
 
     def __init__(self, function: Expression) -> None:
-        most, inputs = self.sizes[-1], range(function.n_in())
+        self.function, most, inputs = function, self.sizes[-1], range(function.n_in())
         self._arguments = [np.zeros((most, function.size1_in(i))) for i in inputs]
         shapes = [function.size_out(i) for i in range(function.n_out())]
         self._results = [np.zeros((most, columns, rows)) for rows, columns in shapes]

@@ -91,8 +91,7 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
     body = scene.polygon.vertices
     # Products of matrices would depend, in the last bit, on how many poses there are.
     heights = np.sin(phi)[:, None] * body[:, 0] + np.cos(phi)[:, None] * body[:, 1]
-    vertex = heights.argmin(axis=1)
-    return -heights.min(axis=1), vertex
+    return -heights.min(axis=1), heights.argmin(axis=1)
 
 
 def close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
@@ -202,8 +201,7 @@ def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tu
     clear = seen.any(axis=1) & (lowest > -1e-12 * link.length) & (link.length > radius)
     # Finger 1 comes to the end of the chain, finger 2 to its start.
     onwards = after if finger == 0 else before
-    last = (seen & ~seen[:, onwards]).argmax(axis=1)
-    vertex = (last + (finger == 0)) % count
+    vertex = ((seen & ~seen[:, onwards]).argmax(axis=1) + (finger == 0)) % count
     away = np.hypot(*(joint - body[vertex]).T)
     far = np.flatnonzero(clear & (away**2 - radius**2 > link.length**2))
     if len(far):
@@ -291,8 +289,7 @@ def _find_angle(
     if kind == SIDE:
         inner = np.arcsin(link.radius / away)
     else:
-        reach = (away**2 + link.length**2 - link.radius**2) / (2 * away * link.length)
-        inner = np.arccos(reach)
+        inner = np.arccos((away**2 + link.length**2 - link.radius**2) / (2 * away * link.length))
     return np.asarray(np.arctan2(y, x) - sign * inner)
 
 
@@ -348,8 +345,7 @@ def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flag
     ]
     for kind in np.unique(fingers, axis=0):
         rows = (fingers == kind).all(axis=1)
-        contacts = tuple(table[k] for k in labels[int(rows.argmax())].tolist())
-        yield Formation(scene, contacts), rows
+        yield Formation(scene, tuple(table[k] for k in labels[int(rows.argmax())].tolist())), rows
 
 
 def find_reach(scene: Scene) -> tuple[float, float]:

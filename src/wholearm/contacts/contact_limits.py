@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Store, exclusive
+from ..common.sharing import Batch, exclusive
 from ..scene.model import Scene
 from .elemental import (
     Contact,
     GapLimit,
     build_features,
     build_gap,
+    build_once,
     candidate_contacts,
     rotate_quarter,
 )
@@ -97,7 +98,7 @@ def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
-    limits = [limit for c in contacts for limit in _build_once(build_limits, c, scene)]
+    limits = [limit for c in contacts for limit in build_once(build_limits, c, scene)]
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
         clearances = _list_clearances(scene, finger, held)
@@ -126,19 +127,8 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
             continue
         if tips and not on_side and (on_tip or contact.index not in behind):
             continue
-        limits.append(_build_once(build_clearance, contact, scene, bool(on_side)))
+        limits.append(build_once(build_clearance, contact, scene, bool(on_side)))
     return limits
-
-
-_LIMITS: Store[dict[Any, Any]] = Store(lambda scene: {}, lambda scene: scene.shape)
-"""Limits of single contacts, which formations of scenes of one shape have in common."""
-
-
-def _build_once(build: Callable[..., Any], contact: Contact, scene: Scene, *options: bool) -> Any:
-    key, limits = (build, contact, *options), _LIMITS(scene)
-    if key not in limits:
-        limits[key] = build(contact, scene, *options)
-    return limits[key]
 
 
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
@@ -197,7 +187,7 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
 
 def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
     """Whether `contact` is the neighbour of one of `held` at the end of its range."""
-    limits = (limit for contact in held for limit in _build_once(build_limits, contact, scene))
+    limits = (limit for contact in held for limit in build_once(build_limits, contact, scene))
     return any(limit.gained == contact for limit in limits)
 
 

@@ -21,11 +21,10 @@ and the same with t = (n_y, -n_x) for W_t and J_t.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -35,6 +34,7 @@ from ..common.errors import InputError
 from ..common.sharing import Store
 from ..scene.model import Scene
 
+_Z = ca.SX.sym("z", 5)  # of all scenes: limits that they share outlive the one that built them
 _PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
 
 
@@ -172,14 +172,8 @@ def build_features(scene: Scene) -> Features:
     return _FEATURES(scene)
 
 
-@lru_cache(maxsize=1)
-def _make_configuration() -> Expression:
-    """The symbol z of all scenes: limits that scenes share outlive the scene that built them."""
-    return ca.SX.sym("z", 5)
-
-
 def _build_features(scene: Scene) -> Features:
-    z = _make_configuration()
+    z = _Z
     body = scene.polygon.vertices
     run = np.roll(body, -1, axis=0) - body
     lengths = np.hypot(run[:, 0], run[:, 1])
@@ -237,6 +231,17 @@ def _find_largest_others(values: list[Expression]) -> list[Expression]:
     after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
     inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
     return [after[0], *inner, before[-1]]
+
+
+_BUILT: Store[dict[Any, Any]] = Store(lambda scene: {}, lambda scene: scene.shape)
+
+
+def build_once(build: Callable[..., Any], contact: Contact, scene: Scene, *options: bool) -> Any:
+    """What `build` makes of a contact: formations of scenes of one shape have it in common."""
+    key, built = (build, contact, *options), _BUILT(scene)
+    if key not in built:
+        built[key] = build(contact, scene, *options)
+    return built[key]
 
 
 def build_gap(contact: Contact, scene: Scene) -> Expression:

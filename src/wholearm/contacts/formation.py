@@ -23,7 +23,15 @@ from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Keeper, Store, exclusive, kept_property
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
-from .elemental import Contact, GapLimit, build_features, build_gap, build_rows, candidate_contacts
+from .elemental import (
+    Contact,
+    GapLimit,
+    build_features,
+    build_gap,
+    build_once,
+    build_rows,
+    candidate_contacts,
+)
 
 
 class Kinematics(NamedTuple):
@@ -39,17 +47,11 @@ class Kinematics(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Formation(Keeper):
-    """A contact formation of a scene.
-
-    Parameters
-    ----------
-    contacts  in the order of every array over contacts
-    rolling   those of the contacts that roll; the others slide
-    """
+    """A contact formation of a scene."""
 
     scene: Scene
-    contacts: tuple[Contact, ...]
-    rolling: tuple[Contact, ...] = ()
+    contacts: tuple[Contact, ...]  # in the order of every array over contacts
+    rolling: tuple[Contact, ...] = ()  # those of them that roll; the others slide
 
     def __post_init__(self) -> None:
         if not set(self.rolling) <= set(self.contacts):
@@ -124,12 +126,12 @@ class Formation(Keeper):
     @property
     def function(self) -> Expression:
         """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
-        return _FUNCTIONS(self)
+        return _FUNCTIONS(self).function
 
     @property
     def roll_function(self) -> Expression:
         """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
-        return _ROLL_FUNCTIONS(self)
+        return _ROLL_FUNCTIONS(self).function
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
         """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
@@ -141,40 +143,28 @@ class Formation(Keeper):
         return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
 
     @kept_property
-    def _batch(self) -> Batch:
-        return Batch(self.function)
-
-    @kept_property
-    def _roll_batch(self) -> Batch:
-        return Batch(self.roll_function)
-
-    @kept_property
     def limits(self) -> tuple[GapLimit, ...]:
         """Where this formation stops being valid, as expressions of its own scene's z."""
         return tuple(list_limits(self.scene, self.contacts))
 
-    @kept_property
-    def _limit_batch(self) -> Batch:
-        return Batch(_LIMIT_FUNCTIONS(self))
-
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
-        C, A, A_t, A_dot_v = self._batch(z, v)
+        C, A, A_t, A_dot_v = _FUNCTIONS(self)(z, v)
         P, P_dot_v = A, A_dot_v
         if self.rolling:
             P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1)
-            P_dot_v = np.concatenate([A_dot_v, self._roll_batch(z, v)[1]], axis=1)
+            P_dot_v = np.concatenate([A_dot_v, _ROLL_FUNCTIONS(self)(z, v)[1]], axis=1)
         return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0], P, P_dot_v[..., 0])
 
     def evaluate_slip(self, z: Array) -> Array:
         """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""
         if not self.rolling:
             return np.zeros((len(z), 0))
-        return self._roll_batch(z, z)[0][..., 0]
+        return _ROLL_FUNCTIONS(self)(z, z)[0][..., 0]
 
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
-        return self._limit_batch(z)[0][..., 0]
+        return _LIMIT_FUNCTIONS(self)(z)[0][..., 0]
 
     @exclusive
     def evaluate_gap(self, contact: Contact, z: Array) -> Array:
@@ -189,8 +179,7 @@ class Formation(Keeper):
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
     candidates, function = _CLEARANCES(scene)
-    values = function(z[None])[0][0, :, 0]
-    near = np.abs(values) < scene.touching
+    near = np.abs(function(z[None])[0][0, :, 0]) < scene.touching
     return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
 
 
@@ -210,47 +199,38 @@ def describe(contacts: Sequence[Contact]) -> str:
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
 
 
-class _Parts:
-    """Expressions of single contacts, shared by the formations of scenes of one shape."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.z, self.v = build_features(scene).z, ca.SX.sym("v", 5)
-        self._parts: dict[Contact, tuple[Expression, ...]] = {}
-
-    def find(self, contact: Contact, scene: Scene) -> tuple[Expression, ...]:
-        """Gap, rows A and A_t, and A' v of a contact."""
-        if contact not in self._parts:
-            gap, A, A_t = build_rows((contact,), scene)
-            self._parts[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
-        return self._parts[contact]
+_V = ca.SX.sym("v", 5)  # of all scenes, as z is
 
 
-_PARTS = Store(_Parts, lambda scene: scene.shape)
+def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
+    """Gap, rows A and A_t, and A' v of a contact."""
+    gap, A, A_t = build_rows((contact,), scene)
+    return gap, A, A_t, ca.jtimes(A @ _V, build_features(scene).z, _V)
 
 
-def _build_function(formation: Formation) -> Expression:
-    scene, features = formation.scene, _PARTS(formation.scene)
-    parts = [features.find(contact, scene) for contact in formation.contacts]
+def _build_function(formation: Formation) -> Batch:
+    scene = formation.scene
+    parts = [build_once(_build_part, contact, scene) for contact in formation.contacts]
     outputs = [
         ca.densify(ca.vertcat(ca.SX(0, width), *(part[k] for part in parts)))
         for k, width in enumerate((1, 5, 5, 1))
     ]
-    return ca.Function("formation", [features.z, features.v], outputs)
+    return Batch(ca.Function("formation", [build_features(scene).z, _V], outputs))
 
 
-def _build_roll_function(formation: Formation) -> Expression:
+def _build_roll_function(formation: Formation) -> Batch:
     scene = formation.scene
-    z, v = build_features(scene).z, ca.SX.sym("v", 5)
+    z = build_features(scene).z
     rolling = [formation.contacts[row] for row in formation.rolling_rows]
     slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, scene) for c in rolling))
     _, _, A_t = build_rows(rolling, scene)
-    bend = ca.jtimes(A_t @ v, z, v)
-    return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
+    bend = ca.jtimes(A_t @ _V, z, _V)
+    return Batch(ca.Function("roll", [z, _V], [ca.densify(slip), ca.densify(bend)]))
 
 
-def _build_limit_function(formation: Formation) -> Expression:
+def _build_limit_function(formation: Formation) -> Batch:
     values = ca.densify(ca.vertcat(*(limit.value for limit in formation.limits)))
-    return ca.Function("limits", [build_features(formation.scene).z], [values])
+    return Batch(ca.Function("limits", [build_features(formation.scene).z], [values]))
 
 
 _FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts))

@@ -9,7 +9,6 @@ rho being the object's radius of gyration, unless the curve has a speed ratio of
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_root
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, metric_weights
 
@@ -138,6 +137,14 @@ class Curve:
         slip[:, list(self.formation.rolling_rows)] = 0.0
         return np.hstack([slip, rho * z_s[:, 3:]])
 
+    @property
+    def is_regular(self) -> bool:
+        """Whether contacts stay independent all along the curve, as segments need."""
+        try:
+            return bool(self.segments)
+        except np.linalg.LinAlgError:
+            return False
+
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         """The curve split at its reversals; `LinAlgError` where contacts are dependent."""
@@ -153,8 +160,7 @@ class Curve:
         breaks = []
         for column in range(rates.shape[1]):
             moving = np.flatnonzero(rates[:, column])
-            flips = np.flatnonzero(np.diff(np.sign(rates[moving, column])))
-            for flip in flips:
+            for flip in np.flatnonzero(np.diff(np.sign(rates[moving, column]))):
                 low, high = grid[moving[flip]], grid[moving[flip + 1]]
 
                 def rate(s: float, k: int = column) -> float:
@@ -229,8 +235,7 @@ def find_vanishing(formation: Formation, z: Array) -> tuple[int, ...]:
 def find_rates(formation: Formation, z: Array) -> Array:
     """Rates of (contacts, joints) in each free direction, (n_c + 2, n), over the largest one."""
     N = tangent_basis(formation, z)
-    A_t = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
-    slips = A_t / formation.scene.scales.length
+    slips = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0] / formation.scene.scales.length
     rates = np.vstack([slips, np.eye(5)[3:]]) @ (N / metric_weights(formation.scene)[:, None])
     return np.asarray(rates / np.linalg.norm(rates, axis=1).max(initial=1e-300))
 
@@ -239,25 +244,6 @@ def refine(s: Array, stop: float) -> Array:
     """Places to look at along a panel with nodes `s`, up to `stop`: three for each node."""
     grid = np.interp(np.linspace(0, len(s) - 1, 3 * len(s)), np.arange(len(s)), s)
     return np.append(grid[grid < stop], min(stop, s[-1]))
-
-
-def find_root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Root of a scalar function between a sign change, to rounding (the Illinois method)."""
-    f_low, f_high = function(low), function(high)
-    rounding = 4 * np.finfo(float).eps * max(abs(low), abs(high))
-    for _ in range(60):
-        middle = high - f_high * (high - low) / (f_high - f_low)
-        f_middle = function(middle)
-        if f_middle == 0.0 or abs(high - low) < rounding:
-            return float(middle)
-        if f_middle * f_high < 0:
-            low, f_low = high, f_high
-        else:
-            f_low /= 2
-        if abs(middle - high) < rounding:
-            return float(middle)
-        high, f_high = middle, f_middle
-    return float(high)
 
 
 def describe_pose(z: Array) -> str:
@@ -271,8 +257,7 @@ def find_on(curve: Curve, z: Array) -> float | None:
     """Where a configuration, shape (5,), is on a curve [m]; None if it is not on it."""
     rho, weights = curve.formation.scene.scales.length, metric_weights(curve.formation.scene)
     near = 1e-9 * rho
-    nodes = np.concatenate([panel.z for panel in curve.panels])
-    away = (nodes - z) ** 2 @ weights
+    away = (np.concatenate([panel.z for panel in curve.panels]) - z) ** 2 @ weights
     first = int(away.argmin())
     if away[first] > (0.2 * rho) ** 2:
         return None
@@ -284,8 +269,7 @@ def find_on(curve: Curve, z: Array) -> float | None:
         if abs(change) < near / 100:
             break
         s += change
-    off = float(np.sqrt((z - at[0]) ** 2 @ weights))
-    return s if off < near else None
+    return s if float(np.sqrt((z - at[0]) ** 2 @ weights)) < near else None
 
 
 def take(curve: Curve, start: float, stop: float) -> Curve:

@@ -121,8 +121,7 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     places = _list_places(formation, z)
     nearest, least = None, np.inf
     for end in ends:
-        off = end.measure(places)
-        order = np.argsort(off)[:24]
+        order = np.argsort(end.measure(places))[:24]
         for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
@@ -173,8 +172,8 @@ class PathGuess:
         return float(np.sqrt(steps**2 @ metric_weights(self.formation.scene)).sum())
 
 
-def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
-    """Path guesses along a curve, or the first `share` of it, split at its reversals."""
+def guess_curve(curve: Curve, share: float) -> list[PathGuess]:
+    """Path guesses along the first `share` of a curve, split at its reversals."""
     stop = share * curve.length
     parts = [part for part in curve.segments if part.start < stop]
     guesses = []
@@ -200,8 +199,7 @@ def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[Pat
     if freedoms == 1:
         curve = trace_phase(phase, z, later)
         return guess_curve(curve, RELEASE_AT if phase.until.is_release else 1.0)
-    goal = _find_goal(phase, z, later)
-    return [connect(formation, z, goal)]
+    return [connect(formation, z, _find_goal(phase, z, later))]
 
 
 def count_freedoms(formation: Formation, z: Array) -> int:
@@ -234,8 +232,7 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         goals = [goal] if goal is not None else []
     if goals:
         return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
-    text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
-    raise InputError("", key, text)
+    raise InputError("", key, f"{phase.until} cannot be reached with these contacts{reasons[0]}")
 
 
 def list_ends(phase: Phase) -> list[Ending]:
@@ -279,6 +276,5 @@ def connect(formation: Formation, start: Array, goal: Array) -> PathGuess:
     z = z[last]
     speed = np.gradient(z, axis=0)
     slip = np.einsum("nij,nj->ni", formation.evaluate(z, speed).A_t, speed)
-    rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
-    signs = np.where(rates < 0, -1.0, 1.0)
+    signs = np.where(np.hstack([slip, speed[:, 3:]]).sum(axis=0) < 0, -1.0, 1.0)
     return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))

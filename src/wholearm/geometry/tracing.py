@@ -8,7 +8,6 @@ integrated spectrally. No coordinate is singled out: none has to be monotonic.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -16,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_root
 from ..common.errors import InputError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
@@ -24,7 +23,7 @@ from ..mechanics.dynamics import metric_weights
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import read_problem
 from ..scene.model import TOUCHING
-from .curve import Curve, Panel, border, describe_pose, find_root, refine
+from .curve import Curve, Panel, border, describe_pose, refine
 
 NODES = 17  # nodes of a panel
 RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
@@ -113,8 +112,7 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
         # Only modes change, anywhere on the path to the next end of a phase.
         curve = curves[0]
     if curve.length < least:
-        key = f"phases[{phase.number}].contacts"
-        raise InputError("", key, f"cannot move: {curve.ending}")
+        raise InputError("", f"phases[{phase.number}].contacts", f"cannot move: {curve.ending}")
     return curve
 
 
@@ -143,11 +141,8 @@ def _trace_phase(phase: Phase, z: Array) -> Curve:
     reason = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
-        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD:
-            # Segments need contacts that stay independent all along the curve.
-            with suppress(np.linalg.LinAlgError):
-                if curve.segments:
-                    return curve
+        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and curve.is_regular:
+            return curve
         reason.append(curve.ending)
     text = f"going one way {reason[0]}, going the other way {reason[1]}"
     text += "; one freedom leaves no choice" if until.pins else ""
@@ -165,13 +160,22 @@ def _holds(formation: Formation, until: Until, z: Array) -> bool:
 
 def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
     """Both unit tangents at `z`, the one that approaches `until` first."""
-    metric = metric_weights(formation.scene)
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    null = np.linalg.svd(P / np.sqrt(metric))[2][-1] / np.sqrt(metric)
+    null, back = find_headings(formation, z, 0.0)
     step = 1e-6 * formation.scene.polygon.gyration_radius
     distances = until_distance(formation, until, np.array([z, z + step * null]))
-    forward = null if abs(distances[1]) <= abs(distances[0]) else -null
-    return [forward, -forward]
+    return [null, back] if abs(distances[1]) <= abs(distances[0]) else [back, null]
+
+
+def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[Array, ...]:
+    """Both unit tangents of a formation's curve at `z`; none where the curve is singular.
+
+    That is where the ratio of singular values of P is below `least`.
+    """
+    root = np.sqrt(metric_weights(formation.scene))
+    _, values, right = np.linalg.svd(formation.evaluate(z[None], z[None]).P[0] / root)
+    if values[-1] < least * values[0]:
+        return ()
+    return right[-1] / root, -right[-1] / root
 
 
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:

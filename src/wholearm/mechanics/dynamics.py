@@ -1,6 +1,6 @@
 """The constrained equations of motion of object and fingers, forward and inverse.
 
-With the notation of `scene.model`, Eqs. (1)-(4) are together
+Eqs. (1)-(4) are together (notation: `README.md`)
 
     M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0,   P = [A; A_t(rolling)],
 

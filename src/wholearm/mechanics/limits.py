@@ -105,7 +105,7 @@ class LimitSet:
     def weigh(self, parameter: Parameter) -> Array:
         """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
         weights = [(limit.parameter.key == parameter.key) * limit.weight for limit in self.limits]
-        return np.concatenate(weights) if weights else np.zeros(0)
+        return np.concatenate(weights)
 
     @cached_property
     def columns(self) -> tuple[Array, Array, Array]:

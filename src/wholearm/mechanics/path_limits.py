@@ -57,8 +57,7 @@ class PathLimits(NamedTuple):
         """The limits with s / `size` in place of s; `size` as the places, or one number."""
         size = np.asarray(size)[..., None]
         columns = [size**0, size, size**2, size, size**0][: self.rows.shape[-1]]
-        scaled = self.rows * np.stack(columns, axis=-1)
-        return PathLimits(scaled, self.cap / size[..., 0] ** 2)
+        return PathLimits(self.rows * np.stack(columns, axis=-1), self.cap / size[..., 0] ** 2)
 
     def relax(self, amount: Array | float) -> PathLimits:
         """The limits with an `amount` of slack more, over their scales."""
@@ -118,8 +117,7 @@ class PathLimits(NamedTuple):
             bound = -slack / by
         never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
         low = np.where(by > 0, bound, never).max(axis=1, initial=-np.inf)
-        high = np.where(by < 0, bound, np.inf).min(axis=1, initial=np.inf)
-        return low, high
+        return low, np.where(by < 0, bound, np.inf).min(axis=1, initial=np.inf)
 
     def extreme(self, b: Array, largest: bool) -> Extreme:
         """The largest or least a at n places for b of shape (n,): of tied rows by the first."""

@@ -216,5 +216,4 @@ def _lengthen(formation: Formation, finger: int, change: float) -> Formation:
         return formation
     fingers = list(formation.scene.fingers)
     fingers[finger] = replace(fingers[finger], length=fingers[finger].length + change)
-    scene = replace(formation.scene, fingers=(fingers[0], fingers[1]))
-    return replace(formation, scene=scene)
+    return replace(formation, scene=replace(formation.scene, fingers=(fingers[0], fingers[1])))

@@ -99,8 +99,7 @@ def speed_sweep(
     profile = _sweep(rows, steps, part, cap, b_guess)
     for _ in range(sweeps - 1 if b_guess is None and rows[..., V].any() else 0):
         before = np.where(profile.b < _UNBOUNDED, profile.b, 0.0)
-        near = before[:, :-1] + part * np.diff(before)
-        profile = _sweep(rows, steps, part, cap, near)
+        profile = _sweep(rows, steps, part, cap, before[:, :-1] + part * np.diff(before))
         # The error of the linearization is the square of the change.
         if np.abs(profile.b - before).max() < 2e-3 * profile.b.max():
             break

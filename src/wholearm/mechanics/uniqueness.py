@@ -55,16 +55,6 @@ class Minors(NamedTuple):
         return float(self.ratios[row]), " with ".join(chosen) or "no contact", row
 
 
-class _Choices(NamedTuple):
-    """Choices of contacts and modes with as many constraints each."""
-
-    modes: tuple[tuple[str, ...], ...]  # mode of each contact, empty for those left out
-    # rows, forces (m, k): of each choice the constraints, as rows of [A; A_t], and the forces, as
-    # rows of [A - U Xi A_t; A; A_t; A - U A_t; A + U A_t]
-    rows: NDArray[np.int64]
-    forces: NDArray[np.int64]
-
-
 def find_minors(
     formation: Formation, kinematics: Kinematics, Xi: Array, sticking: tuple[int, ...] = ()
 ) -> Minors:
@@ -81,26 +71,32 @@ def find_minors(
     rows = np.concatenate([A, A_t], axis=1) if held else A
     K = (rows / formation.scene.mass_diagonal) @ np.concatenate(forces, axis=1).transpose(0, 2, 1)
     ratios, modes = [np.ones((len(A), 1))], [("",) * len(kinds)]
-    for choices in _list_choices(kinds):
-        of_rows = choices.rows[:, :, None]
-        smooth = K[:, of_rows, choices.rows[:, None, :] + len(kinds)]
-        rubbed = K[:, of_rows, choices.forces[:, None, :]]
+    for chosen, choices, pushes in _list_choices(kinds):
+        of_rows = choices[:, :, None]
+        smooth = K[:, of_rows, choices[:, None, :] + len(kinds)]
+        rubbed = K[:, of_rows, pushes[:, None, :]]
         below = np.asarray(np.linalg.det(smooth), dtype=float)
         ratio: Array = np.ones_like(below)
         # Least Gram determinant of independent rows.
         least = 1e-12 * np.einsum("...ii->...i", smooth).prod(axis=-1)
         np.divide(np.linalg.det(rubbed), below, out=ratio, where=below > least)
         ratios.append(ratio)
-        modes += choices.modes
+        modes += chosen
     table = np.concatenate(ratios, axis=1)
     return Minors(table.min(axis=1), table.argmin(axis=1), modes, formation.names)
 
 
+_Choices = tuple[tuple[tuple[str, ...], ...], NDArray[np.int64], NDArray[np.int64]]
+
+
 @lru_cache(maxsize=64)
-def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> tuple[_Choices, ...]:
+def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> list[_Choices]:
     """Every choice that friction makes a difference to, by its number of constraints, at most 5.
 
-    Of each contact `kinds` says whether it does not slide, and whether it has friction.
+    Of each contact `kinds` says whether it does not slide, and whether it has friction. Returns for
+    m choices with k constraints each the mode of each contact, empty for those left out; the
+    constraints, (m, k), as rows of [A; A_t]; and the forces, (m, k), as rows of
+    [A - U Xi A_t; A; A_t; A - U A_t; A + U A_t].
     """
     count = len(kinds)
     groups: dict[int, list[tuple[tuple[str, ...], list[int], list[int]]]] = {}
@@ -115,6 +111,4 @@ def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> tuple[_Choices, ...]:
         rows = normal + [count + k for k in stuck]
         groups.setdefault(len(rows), []).append((modes, rows, forces))
     columns = (tuple(zip(*chosen, strict=True)) for chosen in groups.values())
-    return tuple(
-        _Choices(modes, np.array(rows), np.array(forces)) for modes, rows, forces in columns
-    )
+    return [(modes, np.array(rows), np.array(forces)) for modes, rows, forces in columns]

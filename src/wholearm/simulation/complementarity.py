@@ -24,18 +24,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise, product, takewhile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Expression
-from ..results.torque import TorqueProfile
+from ..common.arrays import Array, Expression, find_root
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
-from .run import Feedback, Run, StuckError, find_root
+from .run import Run, StuckError
 from .stepper import Modes, ModeStepper, bind
 from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Structure, System
 
@@ -161,8 +160,7 @@ def _combine(
     modes[:, owners >= 0], modes[:, owners < 0] = choices[:, owners[owners >= 0]], choices[:, k:]
     active = np.hstack([choices[:, :k] != APART, modes == STICKS])
     sound = active.sum(axis=1) <= n
-    ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
-    return ways[sound], active[sound]
+    return np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))[sound], active[sound]
 
 
 def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list[ContactAnswer]:
@@ -239,7 +237,16 @@ def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
         table -= factors[:, None] * table[row]
         basis[row] = entering
         if leaving == 2 * n + 1:
-            return _read(M, q, basis)
+            # From the original matrix.
+            chosen = basis[basis > n] - n - 1
+            inner, z = M[np.ix_(chosen, chosen)], np.zeros(n)
+            try:
+                z[chosen] = np.linalg.solve(inner, -q[chosen])
+            except np.linalg.LinAlgError:
+                z[chosen] = np.linalg.lstsq(inner, -q[chosen])[0]
+            w = M @ z + q
+            residual = max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w))
+            return np.maximum(z, 0.0), float(residual)
         entering = leaving + n if leaving <= n else leaving - n
         column = table[:, entering]
         # Smaller pivots are rounding of redundant rows.
@@ -264,21 +271,6 @@ def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
         ties = table[chosen, 1 : len(table) + 1] / sizes[least, None]
         return int(chosen[np.lexsort(ties.T[::-1])[0]])
     return int(rows[least[0]])
-
-
-def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> tuple[Array, float]:
-    """Solution of a complementary basis, from the original matrix."""
-    n = len(q)
-    chosen = basis[basis > n] - n - 1
-    z = np.zeros(n)
-    if len(chosen):
-        try:
-            z[chosen] = np.linalg.solve(M[np.ix_(chosen, chosen)], -q[chosen])
-        except np.linalg.LinAlgError:
-            z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen])[0]
-    w = M @ z + q
-    residual = float(max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w)))
-    return np.maximum(z, 0.0), residual
 
 
 class ClosedContacts(NamedTuple):
@@ -387,7 +379,7 @@ class Pattern:
 
 
 class FreeRun(Run):
-    """A running simulation without prescribed contacts.
+    """A running simulation without prescribed contacts; other arguments are those of `Run`.
 
     Attributes
     ----------
@@ -399,15 +391,12 @@ class FreeRun(Run):
     def __init__(
         self,
         system: System,
-        torque: TorqueProfile | Feedback,
-        z: Array,
-        v: Array,
+        *start: Any,
         restitution: float = 0.0,
-        tolerance: float = 1e-9,
         hint: Modes | None = None,
-        wanted: Array | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(system, torque, z, v, tolerance, wanted)
+        super().__init__(system, *start, **options)
         self.restitution = restitution
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
         self.watch, self.unit = Watch(system), system.scales.length
@@ -501,7 +490,6 @@ class FreeRun(Run):
         return gaps, faces
 
     def _find_closed(self) -> ClosedContacts:
-        """Look for what is closed."""
         system, unit = self.system, self.system.scales.length
         gaps, faces = self._face(self.z, self.v)
         near = (gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces
@@ -687,7 +675,6 @@ class FreeRun(Run):
         return self._answer(problem, *likely)
 
     def _note_changes(self, closed: Sequence[int], modes: Modes, rests: bool) -> None:
-        """Record what changes."""
         if rests and self.resting:
             # Other forces that hold the same rest are no event.
             return
@@ -909,7 +896,7 @@ class FreeRun(Run):
         if last >= 0:
             return None
         # Some ten roundings of the gap count as closed.
-        root = find_root(value, right, first, last, self.near, 1e-14 * self.unit, left)
+        root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
         self.step_to(root)
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
@@ -937,26 +924,22 @@ class FreeRun(Run):
         turns[:, passed] = False
         for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
             left, right = times[row : row + 2].tolist()
-            entry = self._find_entry(pair, left, right, -float(ranges[row, pair]))
+
+            def outside(step: float, pair: int = pair) -> float:
+                self.step_to(step)
+                return -float(self.watch.spans[pair])
+
+            # When the pair comes into range.
+            ends, entry = (-float(ranges[row, pair]), outside(right)), right
+            if ends[1] < 0 <= ends[0]:
+                flat = CLOSED * unit
+                entry = find_root(outside, left, right, ends, self.near, flat)
             self.step_to(entry)
             gap = float(self.watch.ahead[pair])
             if gap > -SUNK * unit:
                 return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
             self.step_to(h)
         return None
-
-    def _find_entry(self, pair: int, left: float, right: float, outside: float) -> float:
-        """When a pair comes into range between two instants of a step."""
-
-        def value(step: float) -> float:
-            self.step_to(step)
-            return -float(self.watch.spans[pair])
-
-        within = value(right)
-        if within < 0 <= outside:
-            flat = CLOSED * self.unit
-            return find_root(value, right, outside, within, self.near, flat, left)
-        return right
 
     def _time_to_return(self) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
@@ -1038,7 +1021,7 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     g = structure.geometry.shape[0]
     numbers = ca.SX.sym("numbers", g + 2 * n + 1)
     geometry, units, unit = numbers[:g], numbers[g : g + n], numbers[-1]
-    gaps, ranges = ca.horzsplit(structure.gap_function(end[:n], geometry))
+    gaps, ranges = ca.horzsplit(structure.gaps.function(end[:n], geometry))
     gone = ca.fabs(end[: 2 * n] - motion[: 2 * n])
     travel = ca.mmax((gone[:n] + h * gone[n:]) / units)
     speed, push = (ca.mmax(ca.fabs(part) / units) for part in (end[n : 2 * n], end[2 * n :]))
@@ -1054,7 +1037,7 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     outputs = ca.vertcat(gaps, ranges, longest, alarm, travel)
     look = ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
     v = ca.SX.sym("v", n)
-    both = structure.gap_function(structure.z, geometry)
+    both = structure.gaps.function(structure.z, geometry)
     rates = ca.reshape(ca.jtimes(ca.vec(both), structure.z, v), -1, 2)
     rate = ca.Function("rate", [structure.z, v, geometry], [both, rates])
     (first, opens), (last, closing) = (

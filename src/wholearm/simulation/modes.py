@@ -134,10 +134,7 @@ def list_modes(
 ) -> Iterator[tuple[Array, Mode]]:
     """Each combination of signs of some units, zero where held, that leaves a freedom to move in.
 
-    Parameters
-    ----------
-    signs : (n_c + 2,)  of contacts and joints; those of the units are replaced
-    options             signs to try, for each unit
+    They replace those among `signs`, (n_c + 2,); `options` are those to try, for each unit.
     """
     for choice in product(*options):
         tried = signs.copy()
@@ -183,8 +180,7 @@ class Response(NamedTuple):
     def c_t(self) -> Array:
         """Friction of the contacts, (n_c, 3) [N]; NaN where a flush edge sticks: it is shared."""
         count = self.mode.formation.n_contacts
-        slip = self.mode.formation.sliding_friction * self.signs[:count]
-        c_t = -slip[:, None] * self.c[:count]
+        c_t = -(self.mode.formation.sliding_friction * self.signs[:count])[:, None] * self.c[:count]
         for force, rows in zip(self.c[count:], self.mode.holders, strict=True):
             if rows[0] < count:
                 c_t[list(rows)] = force if len(rows) == 1 else np.nan
@@ -234,8 +230,7 @@ def find_fixed(mode: Mode, rows: ContactRows) -> NDArray[np.bool_]:
     length = np.linalg.norm(free, axis=1)
     P = np.vstack(held) / root
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
-    rest = free - (free @ basis.T) @ basis
-    return np.asarray(np.linalg.norm(rest, axis=1) < 1e-7 * length)
+    return np.asarray(np.linalg.norm(free - (free @ basis.T) @ basis, axis=1) < 1e-7 * length)
 
 
 class StartDeparture(NamedTuple):
@@ -334,8 +329,7 @@ class Rest:
     def held(self) -> TorquePolygon:
         """Torques that friction can hold, and those beyond by no more than rounding."""
         polygon = self.touching.torque_polygon()
-        rounding = 1e-6 * self.formation.scene.scales.torque
-        return polygon._replace(bounds=polygon.bounds + rounding)
+        return polygon._replace(bounds=polygon.bounds + 1e-6 * self.formation.scene.scales.torque)
 
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""

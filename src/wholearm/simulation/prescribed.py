@@ -27,6 +27,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from operator import itemgetter
 from typing import Any, NamedTuple, NoReturn, cast
 
 import casadi as ca
@@ -91,11 +92,8 @@ _PLACES, _INSIDE = _interpolate_stages()
 
 
 class LegRows(NamedTuple):
-    """Where each kind of event value of a leg is; all are in units of the scene."""
+    """Where event values of a leg after those of `EventRows.force` and `cone` are; scaled."""
 
-    force: slice  # c_n
-    # what friction still has to give where it holds (`Mode.holders`): bound - f, then bound + f
-    cone: slice
     turning: slice  # sliding velocities times Xi, then joint speeds times sigma
     limit: slice  # the formation's limits; that of the contact to be gained counts as `until`
     until: int  # distance to the end of the phase; one if that is a release
@@ -130,8 +128,8 @@ def _build_leg(
     limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
     last = layout.slide.stop + 2
     until_row = last + len(limits)
-    parts = layout.force, layout.cone, slice(layout.slide.start, last), slice(last, until_row)
-    rows = LegRows(*parts, until_row, until_row + 1)
+    turning, limit = slice(layout.slide.start, last), slice(last, until_row)
+    rows = LegRows(turning, limit, until_row, until_row + 1)
     sizes = [layout.cone.stop, last - layout.cone.stop, len(limits), 1, 1]
     # Of speeds 2e-13 is rounding.
     slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
@@ -163,15 +161,6 @@ def _build_leg(
     measure = bind(function, [s.outputs, start], event_values)
     texts = [limit.text for limit in limits]
     return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
-
-
-class Choice(NamedTuple):
-    """Combination of friction signs, with its margins."""
-
-    signs: Array  # (n_c + 2,): directions of contacts and joints, zero for what is held or rolls
-    mode: Mode
-    margin: float  # least relative acceleration along the signs or friction margin
-    pressing: float  # least c_n over the scene's force
 
 
 class Arrival(NamedTuple):
@@ -406,8 +395,7 @@ class Replay(Run):
     def _arrive(self, arrival: Arrival, following: Phase | None) -> Outcome | None:
         """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
         until, rate = self.phase.until, arrival.rate
-        text = f"{until} reached {self.when()}"
-        self.note(EventKind.ARRIVAL, text, str(until), rate)
+        self.note(EventKind.ARRIVAL, f"{until} reached {self.when()}", str(until), rate)
         if arrival.strikes and following is not None:
             self.moving = True
             return self.collide(following)
@@ -421,8 +409,7 @@ class Replay(Run):
         if self.problem.scene.has_slow_motors:
             # Rate-limited torques do not step. A motion whose deceleration fades comes early by
             # about the cube root of its error: the old torques act until it was to end.
-            early = self.breaks[self.piece] < self.t < self.stop
-            remaining = arrival.remaining if early else 0.0
+            remaining = arrival.remaining if self.breaks[self.piece] < self.t < self.stop else 0.0
             self.held_until = max(self.held_until, min(self.t + remaining, self.breaks[-1]))
             self.settled_by = self.held_until + self.rest_window
         return None
@@ -454,8 +441,7 @@ class Replay(Run):
                     # Balance may be lost where the torques are about to step or to be the next
                     # phase's.
                     t = self.time(change.x)
-                    soon = self.coming_step - t <= self.rest_window
-                    if not (t < self.settled_by or soon):
+                    if not (t < self.settled_by or self.coming_step - t <= self.rest_window):
                         return self._collapse(change)
             if self.t < self.settled_by < self.stop:
                 self.wait(self.settled_by)
@@ -508,7 +494,7 @@ class Replay(Run):
         Returns them and the first of these instants at which an event shows, since the start of
         the step, infinity if there is none.
         """
-        s, rows = self.s, self.leg.rows
+        s, rows = self.s, self.s.rows
         margins = s.outputs[s.to.values][: rows.cone.stop]
         stage_margins = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
         inside = _INSIDE @ stage_margins
@@ -568,8 +554,7 @@ class Replay(Run):
             coming = self.piece + 1
             speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
         elif self.phase.end is not End.SMOOTH:
-            units = self.system.units[5:]
-            speed = float(np.abs(self.s.outputs[5:10] / units).max())
+            speed = float(np.abs(self.s.outputs[5:10] / self.system.units[5:]).max())
         return speed < SLOW
 
     def _comes_later(self) -> bool:
@@ -607,10 +592,10 @@ class Replay(Run):
             return self._reach()
         if rows.speed in kinds:
             return self.come_to_rest()
-        pulling = [k for k in kinds if k < rows.force.stop]
+        pulling = [k for k in kinds if k < self.s.rows.force.stop]
         if pulling:
             return self.let_go(pulling)
-        cone, limit, mode = rows.cone, rows.limit, self.leg.mode
+        cone, limit, mode = self.s.rows.cone, rows.limit, self.leg.mode
         bounds = [k - cone.start for k in kinds if cone.start <= k < cone.stop]
         if any(mode.declares(k % len(mode.holders)) for k in bounds):
             return self.slip()
@@ -654,8 +639,7 @@ class Replay(Run):
     def _strikes(self) -> bool:
         """Whether the phase ends here with an impact, and not at rest but for an error."""
         rate, time = -self._measure_rate(), self._time_to_stop() / self.problem.scene.scales.time
-        stops = rate < SLOW or rate * time / 2 < REACHED
-        return self.phase.end is End.IMPACT and not stops
+        return self.phase.end is End.IMPACT and not (rate < SLOW or rate * time / 2 < REACHED)
 
     def enter(self, phase: Phase, following: Phase | None) -> None:
         """Enter the formation of `phase`; the energy that its projection takes is lost to impact.
@@ -772,16 +756,11 @@ class Replay(Run):
             return self._hold()
         reserves, holders = self._measure_reserves(), self.leg.mode.holders
         slipping = {holders[k][0] for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE}
-        pulling = self._list_pulling()
+        pulling: list[int] = np.flatnonzero(self.s.outputs[self.s.to.c_n] < -self.rounding).tolist()
         # Whether anything pulls where a contact slips by plan, its next formation says.
         if pulling and not slipping & self.slipping:
             return self.let_go(pulling)
         return self.slip() if slipping else None
-
-    def _list_pulling(self) -> list[int]:
-        """Contacts that would have to pull."""
-        rows: list[int] = np.flatnonzero(self.s.outputs[self.s.to.c_n] < -self.rounding).tolist()
-        return rows
 
     def _decide(self, turned: Sequence[int], enters: bool = False) -> bool:
         """Choose the friction signs of all that stands still; whether all motion has ended.
@@ -812,14 +791,13 @@ class Replay(Run):
         if not self.gets_on():
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
-        chosen, mode, _, _ = self._choose(signs, still)
+        chosen, mode = self._choose(signs, still)
         rows = evaluate_rows(formation, self.z, self.v)
         fixed = find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
         gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
         first = np.array([unit.rows[0] for unit in still])
-        ahead = chosen[first] * (gradients[first] @ self.v)
-        wrong = first[(chosen[first] == 0) | (ahead < 0)]
+        wrong = first[(chosen[first] == 0) | (chosen[first] * (gradients[first] @ self.v) < 0)]
         rolling = gradients[list(formation.rolling_rows)]
         self.project_velocity(np.vstack([rows.A, rolling, gradients[wrong]]))
         self.start_with(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
@@ -882,7 +860,7 @@ class Replay(Run):
 
     def _measure_reserves(self) -> dict[int, float]:
         """Friction margin of the forces that hold what rolls by plan, over the scene's force."""
-        reserves = self.values[self.leg.rows.cone].reshape(2, -1).min(axis=0).tolist()
+        reserves = self.values[self.s.rows.cone].reshape(2, -1).min(axis=0).tolist()
         return {k: x for k, x in enumerate(reserves) if self.leg.mode.declares(k)}
 
     def coast(self, stop: float) -> None:
@@ -951,15 +929,18 @@ class Replay(Run):
         kind, text = describe_change(name, before, after, "slides" if contact else "turns")
         self.note(kind, f"{text} {self.when()}", name)
 
-    def _choose(self, signs: Array, still: Sequence[Unit]) -> Choice:
+    def _choose(self, signs: Array, still: Sequence[Unit]) -> tuple[Array, Mode]:
         """The most consistent signs of what stands still; `JammingError` without any."""
         formation, scales, ahead = self.formation, self.system.scales, self.settling
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
         present, count = evaluate_rows(formation, self.z, self.v), formation.n_contacts
         speeds, ratios = np.repeat([scales.speed, scales.rate], [count, 2]), [1.0]
 
-        def measure(signs: Array, mode: Mode) -> Choice | None:
-            """Margins of one combination; None if it jams or leaves its forces undetermined."""
+        def measure(signs: Array, mode: Mode) -> tuple[float, float] | None:
+            """Least margin of acceleration along the signs or of friction, and least c_n, relative.
+
+            None if the combination jams or leaves its forces undetermined.
+            """
             acceleration, rates = np.zeros(5), np.zeros(count + 2)
             for delay, load in zip((0.0, ahead), loads, strict=True):
                 v = self.v + delay * acceleration
@@ -981,16 +962,17 @@ class Replay(Run):
                     margins.append(cones[mode.holders.index(unit.rows)])
                 elif abs(gained[row]) > CLEAR:
                     margins.append(gained[row])
-            return Choice(signs, mode, float(min(margins)), float(held[:count].min()))
+            return float(min(margins)), float(held[:count].min())
 
         options = [(1.0, -1.0, 0.0) if unit.grips else (1.0, -1.0) for unit in still]
-        patterns = list_modes(formation, signs, still, options)
-        choices = [one for one in (measure(*pattern) for pattern in patterns) if one is not None]
-        pressing = [one for one in choices if one.pressing > -CLEAR and one.margin > -CLEAR]
+        patterns = list(list_modes(formation, signs, still, options))
+        measured = [(measure(*pattern), pattern) for pattern in patterns]
+        choices = [(*margins, pattern) for margins, pattern in measured if margins is not None]
+        pressing = [choice for choice in choices if min(choice[:2]) > -CLEAR]
         # Where none presses a contact is about to be lost, and its forces say which.
-        pulling = [one for one in choices if one.pressing <= -CLEAR]
+        pulling = [choice for choice in choices if choice[1] <= -CLEAR]
         if pressing or pulling:
-            return max(pressing or pulling, key=lambda one: one.margin)
+            return max(pressing or pulling, key=itemgetter(0))[2]
         if min(ratios) <= 0:
             self.fail_to_step(min(ratios))
         text = f"jams {self.when()}: no combination of sliding and sticking is consistent"

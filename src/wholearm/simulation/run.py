@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_root
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
@@ -18,51 +18,6 @@ from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
 from .system import FIRST_STEP, SHORTEST_STEP, STANDING, System
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
-
-
-def find_root(
-    function: Callable[[float], float],
-    high: float,
-    f_low: float,
-    f_high: float,
-    near: float,
-    flat: float,
-    low: float = 0.0,
-) -> float:
-    """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
-
-    Regula falsi of Anderson and Bjorck until the bracket is as narrow as `near` or the function is
-    within `flat`. After a step that has not halved the bracket the next one is that of the square
-    root of the function, which finds double roots, and after two the next one is a bisection.
-    """
-    if f_low <= 0:
-        return low
-    slow, width = -1, abs(high - low)
-    while abs(high - low) > near:
-        middle = high - f_high * (high - low) / (f_high - f_low)
-        slow = slow + 1 if 2 * abs(high - low) > width else 0
-        if not slow:
-            width = abs(high - low)
-        if slow == 1:
-            share = 1 / (1 + math.sqrt(-f_low / f_high))
-            middle = high - share * (high - low)
-        if slow > 1:
-            middle, slow, width = (low + high) / 2, 0, abs(high - low)
-        elif abs(middle - high) < near:
-            middle = high + math.copysign(near, low - high)
-        elif abs(middle - low) < near:
-            middle = low + math.copysign(near, high - low)
-        if middle in (low, high):
-            break
-        f_middle = function(middle)
-        if abs(f_middle) <= flat:
-            return middle
-        if f_middle * f_high < 0:
-            low, f_low = high, f_high
-        else:
-            f_low *= 1 - f_middle / f_high if abs(f_middle) < abs(f_high) else 0.5
-        high, f_high = middle, f_middle
-    return high
 
 
 class StuckError(ArithmeticError):
@@ -101,7 +56,7 @@ class Run(ABC):
         torque: TorqueProfile | Feedback,
         z: Array,
         v: Array,
-        tolerance: float,
+        tolerance: float = 1e-9,
         wanted: Array | None = None,
     ) -> None:
         self.feedback = torque if isinstance(torque, Feedback) else None
@@ -221,8 +176,7 @@ class Run(ABC):
     def load(self, modes: Modes) -> None:
         """Take the steps of some modes from here on, with their signs where they have any."""
         self.modes, degree = modes, self.torque.coefficients.shape[2] - 1
-        key = modes._replace(Xi=(), sigma=())
-        self.s = build_stepper(self.system.structure, key, degree)
+        self.s = build_stepper(self.system.structure, modes._replace(Xi=(), sigma=()), degree)
         inputs, at = self.s.inputs, self.s.at
         self.s.load(self.system, self.tolerance, self.z)
         if modes.sigma:
@@ -312,7 +266,7 @@ class Run(ABC):
                 return float(self.values[row] + shift[row])
 
             ends = float(before[row]), float(after[row])
-            h = find_root(value, h, *ends, self.near, 1e-3 * float(self.slack[row]))
+            h = find_root(value, 0.0, h, ends, self.near, 1e-3 * float(self.slack[row]))
             done.append(row)
             last = row
 

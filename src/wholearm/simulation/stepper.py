@@ -192,8 +192,7 @@ class _Equations:
         self.at = Inputs(*_lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         self.rows = EventRows(*_lay_out(k, 2 * s, k, n))
         seen = (1 + len(INNER_STAGES)) * self.rows.cone.stop
-        outputs = (size, n, k, k, 2, None, self.rows.size, None, seen)
-        self.to = Outputs(*_lay_out(*outputs))
+        self.to = Outputs(*_lay_out(size, n, k, k, 2, None, self.rows.size, None, seen))
 
     def compile(self) -> ModeStepper:
         """Steps, and looks at a state, as functions of the packed inputs."""
@@ -313,8 +312,7 @@ def _build_correction(count: int, n: int) -> Expression:
     """CasADi function (P, r, diagonal of M^-1) -> the shortest x in the metric M with P x = r."""
     P, r, lift = ca.SX.sym("P", count, n), ca.SX.sym("r", count), ca.SX.sym("lift", n)
     lifted = ca.repmat(lift, 1, count) * P.T
-    shift = ca.densify(lifted @ ca.solve(P @ lifted, r))
-    return ca.Function("correct", [P, r, lift], [shift])
+    return ca.Function("correct", [P, r, lift], [ca.densify(lifted @ ca.solve(P @ lifted, r))])
 
 
 def bind(function: Expression, inputs: Sequence[Array], outputs: Array) -> Any:

@@ -104,17 +104,12 @@ class Structure(Keeper):
         return gap, slip, A, A_t, bend, bend_t
 
     @kept_property
-    def gap_function(self) -> Expression:
-        """CasADi function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
+    def gaps(self) -> Batch:
+        """Function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
         least = [ca.mmin(ca.vertcat(1e9, *pair.ranges)) for pair in self.pairs]
         both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
-        return ca.Function("gaps", [self.z, self.geometry], [both])
-
-    @kept_property
-    def gaps(self) -> Batch:
-        """The same for many places."""
-        return Batch(self.gap_function)
+        return Batch(ca.Function("gaps", [self.z, self.geometry], [both]))
 
 
 @lru_cache(maxsize=256)
