@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -48,8 +48,7 @@ class Window:
 
     def bands(self, scene: Scene) -> list[tuple[float, float, int]]:
         """Ranges of phi in which one vertex is on the palm: low, high, vertex."""
-        angles = [phi for phi, _ in self.flush_angles(scene)]
-        ends = [self.phi[0], *angles, self.phi[1]]
+        ends = [self.phi[0], *(phi for phi, _ in self.flush_angles(scene)), self.phi[1]]
         middles = np.array([(a + b) / 2 for a, b in pairwise(ends)])
         vertices = lower(scene, middles)[1]
         bands = zip(ends[:-1], ends[1:], vertices.tolist(), strict=True)
@@ -154,8 +153,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
     def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         corners, m = _corners_at(scene, phi, vertex, near, far), _outward(scene, edge, phi)
         corners[..., 0] += x
-        sign = 1.0 if finger == 0 else -1.0
-        axis = sign * np.column_stack([-m[:, 1], m[:, 0]])
+        axis = (1.0 if finger == 0 else -1.0) * np.column_stack([-m[:, 1], m[:, 0]])
         near_run, far_run = ((corners - base) * axis).sum(axis=2)
         labels = label_closed(closed, vertex)
         within = (near_run > 0) & (near_run <= link.length)
@@ -240,8 +238,7 @@ def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
     """Wanted vertices with `vertex` on the palm and the centroid at x = 0, shape (m, n, 2) [m]."""
     body = scene.polygon.vertices[vertex]
     y = -(np.sin(phi) * body[0] + np.cos(phi) * body[1])
-    vertices = np.array(wanted)[:, None]
-    return np.stack(place_corners(scene, 0 * phi, y, phi, vertices), axis=-1)
+    return np.stack(place_corners(scene, 0 * phi, y, phi, np.array(wanted)[:, None]), axis=-1)
 
 
 def _outward(scene: Scene, edge: int, phi: Array) -> Array:
@@ -266,43 +263,38 @@ def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, 
     return tuple(table[int(index)] for index in label if index != NOWHERE)
 
 
-class _Tracks(NamedTuple):
-    """Tracks that are evaluated together (vectorized)."""
-
-    scene: Scene
-    tracks: Sequence[Track]
-    window: Window | None
-
-    def label(self, owners: Numbers, places: Array) -> Numbers:
-        """Labels, shape (n, 6), of places on tracks; the tracks' indices `owners` increase."""
-        x, phi = np.empty((2, len(places)))
-        starts = np.flatnonzero(np.diff(owners, prepend=-1)).tolist()
-        groups = [slice(a, b) for a, b in pairwise([*starts, len(owners)])]
-        for group in groups:
-            x[group], phi[group] = self.tracks[owners[group.start]].pose(places[group])
-        inside = np.isfinite(x)
-        if self.window is not None:
-            inside &= (x >= self.window.x[0]) & (x <= self.window.x[1])
-        labels = np.full((len(places), 6), NOWHERE)
-        closed = close_fingers(self.scene, x[inside], phi[inside])
-        rows = np.cumsum(inside) - 1
-        for group in groups:
-            (within,) = np.nonzero(inside[group])
-            if len(within):
-                at = group.start + within
-                part = ClosedFinger(*(values[rows[at]] for values in closed))
-                labels[at] = self.tracks[owners[group.start]].label(x[at], phi[at], part)
-        return labels
+def _label(
+    scene: Scene, tracks: Sequence[Track], window: Window | None, owners: Numbers, places: Array
+) -> Numbers:
+    """Labels, (n, 6), of places on tracks, all at once; the tracks' indices `owners` increase."""
+    x, phi = np.empty((2, len(places)))
+    starts = np.flatnonzero(np.diff(owners, prepend=-1)).tolist()
+    groups = [slice(a, b) for a, b in pairwise([*starts, len(owners)])]
+    for group in groups:
+        x[group], phi[group] = tracks[owners[group.start]].pose(places[group])
+    inside = np.isfinite(x)
+    if window is not None:
+        inside &= (x >= window.x[0]) & (x <= window.x[1])
+    labels = np.full((len(places), 6), NOWHERE)
+    closed = close_fingers(scene, x[inside], phi[inside])
+    rows = np.cumsum(inside) - 1
+    for group in groups:
+        (within,) = np.nonzero(inside[group])
+        if len(within):
+            at = group.start + within
+            part = ClosedFinger(*(values[rows[at]] for values in closed))
+            labels[at] = tracks[owners[group.start]].label(x[at], phi[at], part)
+    return labels
 
 
 def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
     """Cut tracks into pieces with one label each, by multisection; only those in the window."""
-    every = _Tracks(scene, tracks, window)
+    label_places = partial(_label, scene, tracks, window)
     sizes = [len(track.places) for track in tracks]
     owners = np.repeat(np.arange(len(tracks)), sizes)
     places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
-    labels = every.label(owners, places)
-    changes = _find_changes(every, owners, places, labels)
+    labels = label_places(owners, places)
+    changes = _find_changes(label_places, owners, places, labels)
     pieces, first = [], 0
     for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
         rows, first = slice(first, first + size), first + size
@@ -323,7 +315,10 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
 
 
 def _find_changes(
-    every: _Tracks, owners: Numbers, places: Array, labels: Numbers
+    label_places: Callable[[Numbers, Array], Numbers],
+    owners: Numbers,
+    places: Array,
+    labels: Numbers,
 ) -> dict[int, list[tuple[float, float, Numbers]]]:
     """Changes of labels by track: last place with the old one, first with the new, and the new."""
     within = owners[1:] == owners[:-1]
@@ -338,13 +333,13 @@ def _find_changes(
         stop = high
         for _ in range(13):
             inner = low[:, None] + (high - low)[:, None] * np.arange(1, PARTS) / PARTS
-            seen = every.label(np.repeat(owner, PARTS - 1), inner.ravel())
+            seen = label_places(np.repeat(owner, PARTS - 1), inner.ravel())
             same = (seen.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)
             first = np.where(same.all(axis=1), PARTS - 1, same.argmin(axis=1))
             ends = np.column_stack([low, inner, high])
             rows = np.arange(len(ends))
             low, high = ends[rows, first], ends[rows, first + 1]
-        new = every.label(owner, high)
+        new = label_places(owner, high)
         for k, before, after, label in zip(
             owner.tolist(), low.tolist(), high.tolist(), new, strict=True
         ):
@@ -360,8 +355,7 @@ def _find_changes(
 
 def _fill(track: Track, low: float, high: float) -> Array:
     """Places from `low` to `high`, close enough together to draw the curve."""
-    inner = track.places[(track.places > low) & (track.places < high)]
-    places = np.array([low, *inner, high])
+    places = np.array([low, *track.places[(track.places > low) & (track.places < high)], high])
     for _ in range(8):
         wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > track.step)
         if not len(wide):

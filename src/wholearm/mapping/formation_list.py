@@ -186,8 +186,7 @@ def trace_problem(problem: Problem) -> list[Array]:
             paths.append(curve.evaluate(np.linspace(0.0, curve.length, 60)).z[:, [0, 2]])
             z = curve.end
         for phase in problem.phases[len(paths) :]:
-            later = problem.phases[phase.index + 1 :]
-            parts = [part.z for part in guess_phase(phase, z, later)]
+            parts = [part.z for part in guess_phase(phase, z, problem.phases[phase.index + 1 :])]
             paths.append(np.concatenate(parts)[:, [0, 2]])
             z = parts[-1][-1]
     except InputError:
@@ -333,13 +332,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     An end that near a change of contacts is moved to it, and a straight leg that leaves a cell by
     no more than that, and comes back, stays in it.
 
-    Parameters
-    ----------
-    start, stop : (2,) [m, rad]  x and phi
-
-    Raises
-    ------
-    InputError  if part of the leg cannot be reached, or it runs through a crossing of borders
+    InputError if part of the leg cannot be reached, or it runs through a crossing of borders.
     """
     leg = choose_leg(scene, start, stop)
     low, high = min(leg.start, leg.stop), max(leg.start, leg.stop)
@@ -424,8 +417,7 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
 
 
 def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
-    inner = [float(s) for piece in kept for s in piece.places[[0, -1]]]
-    ends = [ends[0], *inner, ends[1]]
+    ends = [ends[0], *(float(s) for piece in kept for s in piece.places[[0, -1]]), ends[1]]
     for before, after in zip(ends[::2], ends[1::2], strict=True):
         if after - before > 1e-6 * leg.near:
             pose = leg.at((before + after) / 2)
@@ -480,8 +472,7 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
 
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    track = Track(pose, label, places, np.inf)
-    return Leg(track, 0.0, 1.0, share)
+    return Leg(Track(pose, label, places, np.inf), 0.0, 1.0, share)
 
 
 def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:
@@ -493,8 +484,7 @@ def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, f
     (left, low), (right, high) = np.sort([start, stop], axis=0).tolist()
     if right - left > near[0]:
         reach, places = MISSED * near[1], np.linspace(left - near[0], right + near[0], PLACES)
-        around = Window((left, right), (low - reach, high + reach))
-        for angle, edge in around.flush_angles(scene):
+        for angle, edge in Window((left, right), (low - reach, high + reach)).flush_angles(scene):
             off = max(abs(low - angle), abs(high - angle)) / near[1]
             if off < MISSED:
                 track = palm_track(scene, edge, angle, places)

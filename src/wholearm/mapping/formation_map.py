@@ -147,8 +147,7 @@ def build_map(
     window = window or choose_window(problem)
     x, phi = np.linspace(*window.x, resolution), np.linspace(*window.phi, resolution)
     labels, obstacle = label_grid(scene, x, phi)
-    triples = labels[..., [0, 2, 4]]
-    rows, cell = np.unique(triples[obstacle == 0], axis=0, return_inverse=True)
+    rows, cell = np.unique(labels[..., [0, 2, 4]][obstacle == 0], axis=0, return_inverse=True)
     if not len(rows):
         raise InputError(problem.source, "", "the fingers reach the object nowhere in the window")
     cells = -obstacle
@@ -318,13 +317,7 @@ def _check_motions(
 def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
     """Window of all x that both fingers reach, and of phi up to the flush angles around the phases.
 
-    Parameters
-    ----------
-    phi_deg : [deg]  take this range of phi instead
-
-    Raises
-    ------
-    InputError  if both fingers reach the object nowhere
+    Or of phi in a range [deg]. InputError if both fingers reach the object nowhere.
     """
     scene = problem.scene
     low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
@@ -369,20 +362,11 @@ def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
-    """Estimated least times along borders, from rest at one end to rest at the other one.
+    """Estimated least times along n borders with something flush, end to end, (n, 2) [s].
 
-    Limits are kept at one place of each interval, with any internal force.
-
-    Parameters
-    ----------
-    problem  whose scene and epsilon count
-    borders  with something flush
-
-    Returns
-    -------
-    ndarray, shape (n, 2), [s]
-        With the coordinate along which points are ordered increasing, and decreasing; infinite
-        where no motion keeps the limits, friction jams or contact forces are not unique.
+    With the coordinate along which points are ordered increasing, and decreasing; infinite where no
+    motion keeps the limits, friction jams or contact forces are not unique. Limits are kept at one
+    place of each interval, with any internal force.
     """
     durations = np.full((len(borders), 2), np.inf)
     if not borders:

@@ -71,8 +71,6 @@ DWELL = FieldKind(
 class Until:
     """What ends a phase: a contact gained, a coordinate of the pose reached, or a release.
 
-    Notes
-    -----
     With neither contact nor coordinate the phase ends where the planner chooses, by releasing the
     contacts that the next phase does not have.
     """
@@ -225,14 +223,8 @@ class Goal:
 )
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A manipulation to plan.
+    """A manipulation to plan; an `InputError` names the key in a file of what is not allowed.
 
-    Raises
-    ------
-    InputError  if a value is not allowed; names the key that it has in a file
-
-    Notes
-    -----
     Formations of the phases are those of `scene`, whichever they were made for, so that
     `dataclasses.replace` makes another problem of one scene, without checking it; `with_` checks.
     """
@@ -349,20 +341,16 @@ class Problem:
 
 LENGTH = 1 / 30
 """Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
+_SHARE = "Half width, relative."
 _RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
 PARAMETERS = tuple(
     key(name, text, kind, default=width)
     for text, kind, names, width in (
-        ("Half width, relative.", _RELATIVE, "mass inertia", 0.05),
-        (
-            "Half width, relative.",
-            _RELATIVE,
-            "friction_palm friction_finger1 friction_finger2",
-            0.1,
-        ),
+        (_SHARE, _RELATIVE, "mass inertia", 0.05),
+        (_SHARE, _RELATIVE, "friction_palm friction_finger1 friction_finger2", 0.1),
         ("Half width [m].", NONNEGATIVE, "length1 length2 base1_x base1_y base2_x base2_y", 6e-3),
         ("Half width [m].", NONNEGATIVE, "start_x", 6e-3),
-        ("Half width, relative.", _RELATIVE, "gain1 gain2", 0.01),
+        (_SHARE, _RELATIVE, "gain1 gain2", 0.01),
         ("Half width [s].", NONNEGATIVE, "delay", 1e-3),
     )
     for name in names.split()
@@ -382,12 +370,9 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 def read_widths(
     given: Mapping[str, object], label: str = "uncertainty.{}", length: float = LENGTH
 ) -> dict[str, float]:
-    """Half widths of all ranges, with the defaults of those that are not named; zero is none.
+    """Half widths of all ranges, of those not in `given` the defaults; see `spread_widths`.
 
-    Parameters
-    ----------
-    given, label  as for `spread_widths`
-    length : [m]  the scene's, which defaults of lengths are in proportion to
+    Zero is none. Defaults of lengths are in proportion to the scene's `length` [m].
     """
     defaults = {
         parameter.name: parameter.default * (length if parameter.unit == "m" else 1)
@@ -399,17 +384,9 @@ def read_widths(
 def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
     """Half widths of the ranges that are given, by parameter; zero leaves one as it is.
 
-    A parameter's own range counts before that of a group.
-
-    Parameters
-    ----------
-    given  by name of the parameter, or of a group
-    label  what messages call a range, with a place for its name
-
-    Raises
-    ------
-    InputError  if a name is unknown, or a width is not a number from zero to what makes sense:
-                below one for relative ones
+    A parameter's own range counts before that of a group. Messages call a range `label`, which has
+    a place for its name: InputError if a name is unknown, or a width is not a number from zero to
+    what makes sense, below one for relative ones.
     """
     widths = dict[str, float]()
     for name, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
@@ -426,12 +403,9 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
 
 
 def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
-    """A scene whose numbers are off.
+    """A scene whose numbers are off by `changes`, relative or in the parameters' units, by name.
 
-    Parameters
-    ----------
-    changes  by name of the parameter: relative, or in the parameter's unit. Those of torques and of
-             the start do nothing here.
+    Those of torques and of the start do nothing here.
     """
 
     def change(name: str) -> float:

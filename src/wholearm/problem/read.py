@@ -168,17 +168,10 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
 
 
 def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
-    """The problem with the phases that a plan has found, where it has goals in their place.
+    """The problem with the phases of the plan with `meta`, where it has goals in their place.
 
-    Parameters
-    ----------
-    meta                  of the plan
-    q : (3,) [m, m, rad]  where the plan ends
-    source                the plan's file
-
-    Raises
-    ------
-    InputError  if the plan does not hold its problem, or ends elsewhere than at the last goal
+    An `InputError` that names `source`, its file, if it does not hold its problem, or does not end,
+    at `q`, (3,) [m, m, rad], with the last goal.
     """
     if not problem.goals:
         return problem
@@ -198,16 +191,9 @@ def _check_edge(scene: Scene, edge: object, key: str) -> None:
 
 @exclusive
 def place_start(scene: Scene, flush: int, x: float) -> Array:
-    """The configuration with an edge flush on the palm and both fingers closed, shape (5,).
+    """The configuration with edge `flush` on the palm and both fingers closed, shape (5,).
 
-    Parameters
-    ----------
-    flush    the edge
-    x : [m]  of the object's centroid
-
-    Raises
-    ------
-    InputError  if `x` is out of its range, or a finger does not reach the object
+    InputError if `x` [m], of the centroid, is out of its range, or a finger does not reach.
     """
     check_place(scene, "start.x", x)
     q = place_flush(scene, flush, x)
@@ -262,8 +248,7 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
             text = f"allowed are {count} of -, +, 0 for {' '.join(formation.names)}"
             raise InputError("", f"{name}.signs", f"{signs!r} given; {text}, and - or + per joint")
         for k, contact in enumerate(formation.contacts):
-            rolls = contact in formation.rolling
-            if rolls and signs[k] != "0":
+            if contact in formation.rolling and signs[k] != "0":
                 raise InputError(
                     "", f"{name}.signs", f"{signs!r} given; {contact} rolls: allowed is 0"
                 )
@@ -278,36 +263,26 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
 def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
     """The formation of contacts by name, each sliding unless its name is followed by ``rolling``.
 
-    Raises
-    ------
-    InputError  if there is no such contact
+    InputError if there is no such contact.
     """
-    stems = [n.removesuffix(ROLLING) if isinstance(n, str) else n for n in names]
-    contacts = tuple(_parse_name(stem, scene) for stem in stems)
-    rolls = [stem != name for stem, name in zip(stems, names, strict=True)]
-    rolling = tuple(
-        contact for contact, is_rolling in zip(contacts, rolls, strict=True) if is_rolling
-    )
-    return Formation(scene, contacts, rolling)
-
-
-def _parse_name(name: object, scene: Scene) -> Contact:
-    try:
-        return parse_contact(name, scene)
-    except InputError as error:
-        if isinstance(name, str) and " " in name:
-            raise InputError("", "", f"{error.problem}; {ROLLING!r} may follow") from None
-        raise
+    contacts, rolling = list[Contact](), list[Contact]()
+    for name in names:
+        stem = name.removesuffix(ROLLING) if isinstance(name, str) else name
+        try:
+            contacts.append(parse_contact(stem, scene))
+        except InputError as error:
+            if isinstance(stem, str) and " " in stem:
+                raise InputError("", "", f"{error.problem}; {ROLLING!r} may follow") from None
+            raise
+        rolling += contacts[-1:] * (stem != name)
+    return Formation(scene, tuple(contacts), tuple(rolling))
 
 
 def read_until(scene: Scene, given: object) -> Until:
     """What ends a phase: the name of a contact, or a table of ``contact``, ``phi_deg`` and ``x``.
 
     Without a contact the first coordinate ends the phase; what else is given has to hold there.
-
-    Raises
-    ------
-    InputError  if it is none of these
+    InputError for anything else.
     """
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
@@ -386,7 +361,6 @@ def check_problem(problem: Problem) -> None:
 
 
 def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
-    """Check a goal; `key` is where it stands in a file."""
     if (goal.flush is None) == (goal.phi is None):
         both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
         raise InputError("", key, f"{both} given; allowed is one of the two")
@@ -604,7 +578,6 @@ def _describe(table: Table) -> dict[str, Any]:
 
 
 def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
-    """The schema of a table."""
     return {
         "type": "object",
         **({"description": text} if text else {}),

@@ -29,18 +29,11 @@ _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 def change_table(
     table: Mapping[str, Any], changes: Mapping[str, Any], names: Mapping[str, Sequence[str]]
 ) -> dict[str, Any]:
-    """Return a copy of `table` with other values.
+    """Return a copy of the nested tables of a problem file with other values.
 
-    Parameters
-    ----------
-    table    the nested tables of a problem file
-    changes  new values by short name, or by a dotted key as messages write it, such as
-             ``phases[2].until``. None removes a key.
-    names    short names and their dotted keys, see `name_keys`
-
-    Raises
-    ------
-    InputError  if a name is unknown, or a dotted key leads through something that is no table
+    `changes` are by short name (`names`, see `name_keys`), or by a dotted key as messages write it,
+    such as ``phases[2].until``; None removes a key. InputError if a name is unknown, or a dotted
+    key leads through something that is no table.
     """
     changed: dict[str, Any] = copy.deepcopy(dict(table))
     for name, value in changes.items():
@@ -210,10 +203,8 @@ def name_contacts(phase: Phase) -> list[str]:
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     """Write a problem to a ``.toml`` file, which loads as the same.
 
-    Raises
-    ------
-    InputError  if the file cannot be written, or the problem starts where no file can say: with no
-                edge flush on the palm, or a finger that does not touch
+    InputError if the file cannot be written, or the problem starts where no file can say: with no
+    edge flush on the palm, or a finger that does not touch.
     """
     require_ending(path, ".toml")
     if not problem.table:

@@ -1,32 +1,8 @@
 """The data model: a polygon, a hand of a palm and two fingers, friction and gravity; their ranges.
 
-The notation that every docstring of the package refers to:
-
-========  =======================================================  ============
-symbol    meaning                                                  shape, unit
-========  =======================================================  ============
-q         pose (x, y, phi) of the object's centroid                (3,) m, rad
-theta     joint angles, anticlockwise from +x                      (2,) rad
-z         the five degrees of freedom (q, theta)                   (5,)
-C         C-functions: signed gaps, positive when apart            (n_c,) m
-W_n, W_t  normal and tangential wrench matrices of the object      (3, n_c)
-J_n, J_t  normal and tangential Jacobians of the fingers           (n_c, 2)
-c_n, c_t  normal and tangential wrench intensities                 (n_c,) N
-U, Xi     friction coefficients; sliding directions (+1 or -1)     (n_c,)
-tau       joint torques                                            (2,) N m
-A, A_t    [W_n^T, -J_n] and [W_t^T, -J_t]                          (n_c, 5)
-c         contact forces: c_n, then c_t of the R rolling contacts  (n_c + R,) N
-P         constraints: A, then A_t of rolling contacts             (n_c + R, 5)
-G         forces: A - U Xi A_t, then A_t of rolling contacts       (n_c + R, 5)
-M5        diag(m, m, I, J_1, J_2)                                  (5, 5)
-========  =======================================================  ============
-
-Finger 1 (index 0) is the right one, finger 2 (index 1) the left one. The normal n of a contact
-points into the object and its tangent is t = (n_y, -n_x).
-
-References
-----------
-S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the Plane".
+The notation of all docstrings, such as q, theta, z, C, A, A_t, c, P, G and M5, is that of
+`mechanics/README.md`. Finger 1 (index 0) is the right one, finger 2 (index 1) the left one. The
+normal n of a contact points into the object and its tangent is t = (n_y, -n_x).
 """
 
 from __future__ import annotations
@@ -190,8 +166,7 @@ class Polygon:
         _check_shape(corners, edges, size)
         if headings.sum() > 2 * np.pi + 1e-6:
             raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
-        neighbours = local + np.roll(local, -1, axis=0)
-        middle = (neighbours * cross[:, None]).sum(axis=0) / (6 * area)
+        middle = ((local + np.roll(local, -1, axis=0)) * cross[:, None]).sum(axis=0) / (6 * area)
         vertices = local - middle
         after = np.roll(vertices, -1, axis=0)
         squares = (vertices**2 + vertices * after + after**2).sum(axis=1)

@@ -11,10 +11,11 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, pairwise, takewhile
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, cast
 
 from ..common.parallel import Task, share
@@ -205,60 +206,53 @@ class RefinedPath(NamedTuple):
     straight: bool = True  # guess: straight through the cell, or to the nearest end of the phase
 
 
-@dataclass
-class ReleaseSearch:
-    """Pattern search for the place where an edge leaves a border for a cell.
+def search_release(
+    plan: Callable[[RefinedPath], CoarsePlan | None],
+    best: CoarsePlan,
+    to_go: CostToGo | None = None,
+    known: Mapping[RefinedPath, CoarsePlan | None] = MappingProxyType({}),
+) -> list[CoarsePlan]:
+    """Pattern search for the place where an edge leaves a border: the fastest plan, then others.
 
-    Least time of the edge and of a border that follows where it lands.
+    By the least time of the edge and of a border that follows where it lands (`to_go`); `known` are
+    plans that were made before.
     """
+    least, tried, others = time_with(to_go, best), set[RefinedPath](), list[CoarsePlan]()
 
-    plan: Callable[[RefinedPath], CoarsePlan | None]
-    best: CoarsePlan
-    to_go: CostToGo | None = None  # time of what follows [s]
-    known: dict[RefinedPath, CoarsePlan | None] = field(
-        default_factory=dict
-    )  # plans that were made before
-    _tried: set[RefinedPath] = field(default_factory=set)
-    _others: list[CoarsePlan] = field(default_factory=list)
-    _least: float = math.inf  # time of the best plan and of what follows [s]
+    def gains(path: RefinedPath) -> bool:
+        """Plan a path that has not been tried; whether it is the fastest one."""
+        nonlocal best, least
+        if path in tried:
+            return False
+        tried.add(path)
+        if (made := known[path] if path in known else plan(path)) is None:
+            return False
+        time = time_with(to_go, made)
+        better = time < GAIN * least
+        others.append(best if better else made)
+        best, least = (made, time) if better else (best, least)
+        return better
 
-    def run(self) -> list[CoarsePlan]:
-        """The fastest plan, followed by the others."""
-        self._least = time_with(self.to_go, self.best)
-        # The same place again where another end may lead on faster.
-        if self.to_go:
-            self._try(RefinedPath(0))
-        self._tried.add(RefinedPath(0))
-        # In motion the planner chooses the place.
-        if not self._try(RefinedPath(None)):
-            path = self._move(RefinedPath(0), STEPS)
-            if self._try(path._replace(straight=False)):
-                self._move(path._replace(straight=False), STEPS[1:])
-        return [self.best, *self._others]
-
-    def _move(self, path: RefinedPath, steps: Sequence[int]) -> RefinedPath:
+    def shift(path: RefinedPath, steps: Sequence[int]) -> RefinedPath:
         """Shift the place for as long as that gains; first towards the start of the border."""
         place, sign = path.move or 0, -1
         for step in steps:
             moves = (sign * step, -sign * step)
-            while moved := next((m for m in moves if self._try(path._replace(move=place + m))), 0):
+            while moved := next((m for m in moves if gains(path._replace(move=place + m))), 0):
                 place, sign = place + moved, 1 if moved > 0 else -1
                 moves = (moved, -moved)
         return path._replace(move=place)
 
-    def _try(self, path: RefinedPath) -> bool:
-        """Plan a path that has not been tried; whether it is the fastest one."""
-        if path in self._tried:
-            return False
-        self._tried.add(path)
-        plan = self.known[path] if path in self.known else self.plan(path)
-        if plan is None:
-            return False
-        time = time_with(self.to_go, plan)
-        better = time < GAIN * self._least
-        self._others.append(self.best if better else plan)
-        self.best, self._least = (plan, time) if better else (self.best, self._least)
-        return better
+    # The same place again where another end may lead on faster.
+    if to_go:
+        gains(RefinedPath(0))
+    tried.add(RefinedPath(0))
+    # In motion the planner chooses the place.
+    if not gains(RefinedPath(None)):
+        path = shift(RefinedPath(0), STEPS)
+        if gains(path._replace(straight=False)):
+            shift(path._replace(straight=False), STEPS[1:])
+    return [best, *others]
 
 
 @dataclass(eq=False)
@@ -371,11 +365,7 @@ class RoutePlanner:
         return best
 
     def _plan_parts(
-        self,
-        route: Route,
-        problem: Problem,
-        options: PlanOptions,
-        report: Callable[[str], None],
+        self, route: Route, problem: Problem, options: PlanOptions, report: Callable[[str], None]
     ) -> list[PlannedPhase] | Lost:
         """Rough plans of a route's parts, one after the other, or why one has none."""
         coarse = self.roadmap.coarse_plans
@@ -431,8 +421,7 @@ class RoutePlanner:
         """Collect routes by a heuristic, while a better one is possible."""
         looked, most = 0, self._measurements + MEASURED
         for route in self.search.run(heuristic):
-            enough = len(self.found) >= wanted
-            if enough and self.estimate(route) > self._best:
+            if len(self.found) >= wanted and self.estimate(route) > self._best:
                 return
             if looked > wanted + TRIED or self._measurements >= most:
                 return
@@ -466,7 +455,7 @@ class RoutePlanner:
 
     def _refine(self, route: Route, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
-        roadmap, searches = self.roadmap, dict[Edge, ReleaseSearch]()
+        roadmap, searches = self.roadmap, dict[Edge, partial[list[CoarsePlan]]]()
         for edge, after in pairwise((*route.edges, None)):
             if edge is None or edge.left is None or edge in roadmap.refined:
                 continue
@@ -474,14 +463,15 @@ class RoutePlanner:
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
-            searches[edge] = ReleaseSearch(partial(self._release, edge, to_go), plan, to_go)
+            release = partial(self._release, edge, to_go)
+            searches[edge] = partial(search_release, release, plan, to_go)
         roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
-            (search,) = searches.values()
+            ((edge, search),) = searches.items()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            plans = self._share([partial(search.plan, path) for path in paths])
-            search.known = dict(zip(paths, plans, strict=True))
-        results = self._share([search.run for search in searches.values()])
+            made = self._share([partial(search.args[0], path) for path in paths])
+            searches[edge] = partial(search, known=dict(zip(paths, made, strict=True)))
+        results = self._share(list(searches.values()))
         for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 

@@ -164,12 +164,8 @@ def find_opening(
     """The change of a single number with which the goal is reached, in words and as such.
 
     It is looked for on the borders that are shut, and tried by a search beyond those that it opens;
-    then among other lengths and places of the fingers.
-
-    Parameters
-    ----------
-    search         which did not reach the goal
-    seconds : [s]  processor time that this has taken
+    then among other lengths and places of the fingers. The `search` that did not reach the goal has
+    taken `seconds` of processor time.
     """
     report("looking for a number that opens the way")
     cuts, tried = list_cut_borders(search), list[str]()

@@ -20,7 +20,7 @@ from ..common.errors import InputError, SolverError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.path_guess import STILL, count_freedoms, find_end
-from ..geometry.tracing import CostToGo, split_blocks, trace_phase
+from ..geometry.tracing import CostToGo, find_headings, split_blocks, trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
 from ..planning.blocks import BlockPlan, Planning, estimate_time_to_go, plan_next
@@ -37,15 +37,7 @@ from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
 from ..results.plan_record import ROLLS
 from ..scene.model import Scene
-from .edges import (
-    DEPENDENT,
-    INTERVALS,
-    Edge,
-    EdgeStep,
-    describe_steps,
-    find_headings,
-    point_out,
-)
+from .edges import DEPENDENT, INTERVALS, Edge, EdgeStep, describe_steps, point_out
 from .places import RoadmapPlace, close_place, measure_apart
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
@@ -206,10 +198,7 @@ def plan_part(
 ) -> list[PlannedPhase] | Lost:
     """Rough plans of edges one after the other from the problem's start, or why there are none.
 
-    Parameters
-    ----------
-    edges    with coarse plans of those through cells
-    guessed  whether these are the initial guesses
+    Coarse plans of edges through cells are the initial guesses if `guessed`.
     """
     owners, borders = list[int](), dict[int, Edge]()  # the latter by their phase
     steps = [step for edge, coarse in edges for step in (coarse or edge).steps]

@@ -14,7 +14,7 @@ from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of, find_on, join, take
-from ..geometry.tracing import HELD, trace_curve
+from ..geometry.tracing import HELD, find_headings, trace_curve
 from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import NoMotionError, find_duration, make_cosine_grid, speed_sweep
@@ -102,8 +102,7 @@ def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
         np.concatenate([getattr(b, key) for b in limits]) for key in ("steps", "part", "z")
     )
     try:
-        motion = speed_sweep(PathLimits(rows, cap), steps, part)
-        return float(find_duration(motion.b, steps))
+        return float(find_duration(speed_sweep(PathLimits(rows, cap), steps, part).b, steps))
     except NoMotionError as error:
         return f"no motion keeps its limits at {describe_pose(z[min(error.interval, len(z) - 1)])}"
 
@@ -113,11 +112,7 @@ def _find_ambiguity(
 ) -> tuple[str, float]:
     """Why contact forces along a curve are not unique (else empty), and up to where they are [m].
 
-    Parameters
-    ----------
-    s, at : (n,)   places, and the curve there
-    owners : (n,)  the segment of each place
-    least          uniqueness margin (P-matrix)
+    At places s, (n,), of segments `owners`, (n,); `least` is the uniqueness margin (P-matrix).
     """
     formation = curve.formation
     directions = directions_of(curve, owners)
@@ -276,28 +271,10 @@ def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
         barred = limit < -BARRED * least
         curve = None if barred else trace_curve(formation, z, heading, Until())
         traced.append(curve if curve is not None and curve.length > least else None)
-    curves = [curve for curve in traced if curve is not None and _is_regular(curve)]
+    curves = [curve for curve in traced if curve is not None and curve.is_regular]
     if curves and len(curves) == 2 - traced.count(None):
         known.append(join(*traced[::-1]))
     return curves
-
-
-def find_headings(formation: Formation, z: Array) -> tuple[Array, ...]:
-    """Both unit tangents of a formation's curve at `z`; none where the curve is singular."""
-    metric = np.sqrt(metric_weights(formation.scene))
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0] / metric
-    _, values, right = np.linalg.svd(P)
-    if values[-1] < 1e-7 * values[0]:
-        return ()
-    null = right[-1] / metric
-    return null, -null
-
-
-def _is_regular(curve: Curve) -> bool:
-    try:
-        return bool(curve.segments)
-    except np.linalg.LinAlgError:
-        return False
 
 
 def _find_gained(curve: Curve) -> Contact | None:

@@ -8,12 +8,12 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_root
 from ..common.errors import InfeasibleError
 from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
-from ..geometry.curve import Curve, describe_pose, find_root, refine
+from ..geometry.curve import Curve, describe_pose, refine
 from ..geometry.path_guess import close_contacts
 from ..geometry.tracing import HELD
 from ..problem.definition import Goal, Until
@@ -54,8 +54,7 @@ def close_place(place: RoadmapPlace) -> RoadmapPlace | None:
     """A place with all of its contacts closed exactly; None where they do not close."""
     # In the order of the formations at the place, to share their compiled functions.
     contacts = sorted(place.contacts, key=lambda c: -1 if c.finger is None else c.finger)
-    formation = Formation(place.scene, tuple(contacts))
-    z = close_contacts(formation, place.z, np.zeros(0))
+    z = close_contacts(Formation(place.scene, tuple(contacts)), place.z, np.zeros(0))
     return None if z is None else replace(place, z=z)
 
 
@@ -96,8 +95,7 @@ def measure_apart(scene: Scene, z: Array, other: Array) -> float:
 def is_flush(place: RoadmapPlace, edge: int) -> bool:
     """Whether an edge lies on the palm."""
     count = place.scene.polygon.n_vertices
-    palm = {c.index for c in place.contacts if c.finger is None}
-    return {edge, (edge + 1) % count} <= palm
+    return {edge, (edge + 1) % count} <= {c.index for c in place.contacts if c.finger is None}
 
 
 def is_at(place: RoadmapPlace, goal: Goal) -> bool:
@@ -146,8 +144,6 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
     if not len(changes):
         return None
     k = int(changes[0])
-    if off[k + 1] == 0:
-        return float(grid[k + 1])
     return find_root(
         lambda s: float(curve.interpolate(np.array([s]))[0][0, row]) - value,
         float(grid[k]),

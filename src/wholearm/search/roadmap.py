@@ -63,11 +63,6 @@ STEPS, MIDDLES, PART = make_cosine_grid(NODES)
 """Intervals over the path's length, and the places in them where limits are kept."""
 
 
-def can_start(scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array) -> Flags:
-    """Whether motions along straight paths can start from rest, shape (n,); see `time_paths`."""
-    return _evaluate(scene, epsilon, labels, poses, runs).can_rest()
-
-
 def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends: Array) -> Array:
     """Least times of straight paths inside cells from rest to rest, or infinite, shape (n,).
 
@@ -82,12 +77,12 @@ def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, end
         return np.zeros(0)
     poses = (starts[:, None] + MIDDLES[:, None] * (ends - starts)[:, None]).reshape(-1, 2)
     labels, runs = np.repeat(labels, NODES, axis=0), np.repeat(ends - starts, NODES, axis=0)
-    rows, cap = _evaluate(scene, epsilon, labels, poses, runs)
+    rows, cap = evaluate_paths(scene, epsilon, labels, poses, runs)
     limits = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
     return speed_sweep(limits, STEPS, PART, sweeps=2).find_durations(STEPS)
 
 
-def _evaluate(
+def evaluate_paths(
     scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array
 ) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
@@ -374,7 +369,8 @@ def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
     kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
     rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
     if len(rays.sources):
-        rays = rays.pick(can_start(scene, epsilon, rays.labels, rays.starts, rays.runs))
+        limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
+        rays = rays.pick(limits.can_rest())
     s, after = _find_exits(scene, rays)
     rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
     return _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
