@@ -56,6 +56,7 @@ from wholearm.benchmark.skip import STUDY as SKIP
 from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
+from wholearm.common.document import Document, Table
 from wholearm.common.journal import Journal
 from wholearm.common.parallel import Processes, run_all
 from wholearm.planning.nlp import record_runs
@@ -217,7 +218,7 @@ def test_the_table_has_every_measurement_and_exponent() -> None:
         for work in works
         for k in sizes
     ]
-    text = GROWTH.report(measured, argparse.Namespace())[0]
+    text = Document("", parts=GROWTH.report(measured, argparse.Namespace())[0]).to_markdown()
     rows = iter(line for line in text.splitlines() if " [s] | " in line)
     for grows, (works, sizes) in WORK.items():
         assert f"## {grows.capitalize()}" in text
@@ -306,8 +307,9 @@ def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
         {"case": ["anywhere", "a figure", having, 0], **spend(plan)}
         for having, plan in zip((False, True), pair, strict=True)
     ]
-    *_, row = SKIP.report(rows, argparse.Namespace())[0].splitlines()
-    name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
+    *_, table = SKIP.report(rows, argparse.Namespace())[0]
+    assert isinstance(table, Table)
+    ((name, *cells),) = table.cells
     assert name == "a figure" and len(cells) == 8
     assert cells[0] == cells[1] and cells[2] == cells[3]
     # Drawing costs, and nothing of it is run where no figure is wanted.

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from wholearm.benchmark.study import Case, Row, Study, measure_case
+from wholearm.benchmark.study import Case, Findings, Row, Study, measure_case
+from wholearm.common.document import Table
 
 
 def allow(task: str) -> float:
@@ -73,10 +74,9 @@ class Steps(Study):
             number, steps = number // 2 if number % 2 == 0 else 3 * number + 1, steps + 1
         return {"number": start[0], "steps": steps, "findings": ["no natural one"][number:]}
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
-        lines = ["| number | steps |", "|---|---|"]
-        lines += [f"| {row['number']} | {row['steps']} |" for row in rows]
-        return "\n".join(lines), [text for row in rows for text in row["findings"]]
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
+        table = Table(["number:d", "steps:d"], [(row["number"], row["steps"]) for row in rows])
+        return [table], [text for row in rows for text in row["findings"]]
 
 
 STUDY = Steps()

@@ -35,6 +35,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
+from ..common.document import Table
 from ..common.files import read_json, write_text
 from ..geometry.tracing import trace_phases
 from ..planning.nlp import record_runs
@@ -47,7 +48,7 @@ from ..verification.verdict import find_least_force
 from .damage import BASE, STRANGE, change_tree, damage_torques
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
-from .study import Case, Row, Study, format_table, name_case
+from .study import Case, Findings, Row, Study, name_case
 
 PROBLEMS = (
     "box_rolling", "heptagon", "heptagon_four_contacts", "heptagon_impact", "heptagon_twice",
@@ -631,7 +632,7 @@ class Corpus(Study):
             perturb_scenes(self.rounding)
         return {"answer": answer(case, self.problems)}
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """How many answers of each family are the same, and which differ; or they are stored."""
         answers = {name_case(row): row["answer"] for row in rows}
         if options.update:
@@ -652,13 +653,15 @@ class Corpus(Study):
             mine = [row for row in rows if family in ("all", row["case"][0])]
             count = Counter(verdicts[name_case(row)][0] for row in mine)
             seconds = sum(row["seconds"] for row in mine)
-            table.append((family, len(mine), *(count[kind] for kind in kinds), f"{seconds:.0f}"))
-        lines = [*format_table(["family", "cases", *kinds, "processor time [s]"], table), ""]
-        for name, (kind, texts) in verdicts.items():
-            if kind in kinds[1:3]:
-                lines.append(f"* {kind}: {name}: {texts[0]}")
+            table.append((family, len(mine), *(count[kind] for kind in kinds), seconds))
+        heads = ["family", *(f"{name}:d" for name in ("cases", *kinds)), "processor time [s]:.0f"]
+        others = [
+            f"* {kind}: {name}: {texts[0]}"
+            for name, (kind, texts) in verdicts.items()
+            if kind in kinds[1:3]
+        ]
         wrong = {name: texts for name, (kind, texts) in verdicts.items() if kind == "differs"}
-        return "\n".join(lines), [
+        return [Table(heads, table), "\n".join(others)], [
             f"{name}: {text}" for name, texts in wrong.items() for text in texts[:3]
         ]
 

@@ -15,13 +15,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from ..common.document import Table
 from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
 from .scenes import name_first
-from .study import Case, Row, Study, format_table
+from .study import Case, Findings, Row, Study
 
 WORK = {
     "intervals": (("least time", "margin"), (50, 100, 200, 400, 800, 1600, 3200)),
@@ -53,19 +54,21 @@ class Growth(Study):
         run_work(dict(read_problem(path).table), grows, work, size)
         return {"grows": grows, "work": work, "size": size}
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Tables with the exponents."""
-        lines = ["Processor time and rise of the peak memory, each in a process of its own.", ""]
+        parts: list[str | Table] = [
+            "Processor time and rise of the peak memory, each in a process of its own."
+        ]
         for grows, (works, sizes) in WORK.items():
-            lines += [f"## {grows.capitalize()}", ""]
             table = []
             for work, (field, (unit, _)) in product(works, FIELDS.items()):
                 measured_sizes, values = select(rows, grows, work, field)
-                shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
+                missing = [None] * (len(sizes) - len(values))
                 exponent = fit_exponent(measured_sizes, values)
-                table.append((f"{work} [{unit}]", *shown, f"{exponent:.2f}"))
-            lines += [*format_table(["work", *map(str, sizes), "exponent"], table), ""]
-        return "\n".join(lines), []
+                table.append((f"{work} [{unit}]", *values, *missing, exponent))
+            heads = ["work", *(f"{size}:.3g" for size in sizes), "exponent:.2f"]
+            parts += [f"## {grows.capitalize()}", Table(heads, table)]
+        return parts, []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Cost above, memory below, over what grows, on logarithmic axes."""

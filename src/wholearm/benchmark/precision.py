@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ..common.arrays import Array, Expression
+from ..common.document import Table
 from ..common.errors import InputError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -57,7 +58,7 @@ from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
-from .study import Case, Row, Study, format_table
+from .study import Case, Findings, Row, Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -760,8 +761,7 @@ Errors of states are relative to the scene's length and time. A plan counts as s
 torques, replayed open loop by other equations than its own, keep every contact and end within 1e-2
 of the end. Its three errors are those of the phase time, against the lower bound of `solve
 --certify`, of the replayed end state, and the worst violation between nodes, over the object's
-weight or the torque limit.
-"""
+weight or the torque limit."""
 
 
 TARGETS = dict.fromkeys(SIMULATION, (1e-6, 1e-9, 1e-11)) | dict.fromkeys(
@@ -793,14 +793,14 @@ def _find_times(rows: Sequence[Row], target: float, count: int | None) -> dict[s
 
 def _format_targets(
     rows: Sequence[Row], study: str, title: str, count: int | None, limit: float
-) -> list[str]:
+) -> list[str | Table]:
     """Times to reach errors, and how many times as long as ours that is."""
     groups, table = _group(rows, study), []
     own = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
     if own is None:
         return []
     for method, group in groups.items():
-        cells = [method]
+        cells: list[Any] = [method]
         for target in TARGETS[study]:
             times, ours = (_find_times(part, target, count) for part in (group, own))
             names = times.keys() & ours.keys()
@@ -809,12 +809,12 @@ def _format_targets(
                 find_mean([min(part[name], limit) for name in names] or [math.nan])
                 for part in (times, ours)
             )
-            shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
+            shown = (mean, mean / least) if reached else (None, None)
             cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
         table.append(cells)
-    heads = [head for t in TARGETS[study] for head in (f"{t:g} [s]", "reached", "times ours")]
+    heads = [(f"{t:g} [s]:.4f", "reached", "times ours:.2g") for t in TARGETS[study]]
     title = f"## {study[0].upper()}{study[1:]}{title}"
-    return [title, "", *format_table(["method", *heads], table), ""]
+    return [title, Table(["method", *chain(*heads)], table)]
 
 
 def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
@@ -891,18 +891,18 @@ class Precision(Study):
         row = dict(zip(self.columns[:4], case, strict=False))
         return row if median is None else row | median._asdict()
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """All tables."""
-        lines, measured = [INTRODUCTION], [row for row in rows if "errors" in row]
+        measured = [row for row in rows if "errors" in row]
+        parts: list[str | Table] = [INTRODUCTION]
         for study in SIMULATION:
-            lines += _format_targets(measured, study, "", None, options.limit)
+            parts += _format_targets(measured, study, "", None, options.limit)
         for study in PLANNING:
             title = ", by the error of the phase time"
-            lines += _format_targets(measured, study, title, 1, options.limit)
-            lines += _format_targets(measured, study, ", by all three errors", None, options.limit)
+            parts += _format_targets(measured, study, title, 1, options.limit)
+            parts += _format_targets(measured, study, ", by all three errors", None, options.limit)
         table = [(name, method.settings) for name, method in METHODS.items()]
-        lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
-        return "\n".join(lines), []
+        return [*parts, "## Settings", Table(["method", "settings"], table)], []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Mean run time over the error that half of the phases keep, one line for each method."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import time
 import tomllib
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.document import Table
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..common.fields import choice
 from ..mapping.formation_list import format_route, list_formations
@@ -37,8 +37,7 @@ from ..results.trajectory import Trajectory
 from ..search.find_route import Answer, find_route, forget_roadmaps
 from ..verification.free import verify_policy
 from ..verification.verify import verify
-from .scenes import Table
-from .study import Case, Row, Study, format_table
+from .study import Case, Findings, Row, Study
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
 SAME = 1e-4  # relative difference of values of plans that count as the same
@@ -88,38 +87,40 @@ class Queries(Study):
             row["second"] = time.process_time() - started
         return row | {"kind": "solved"} | (_carry_out(problem, answer, ways) if ways else {})
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """What came of them, and the times."""
-        kinds = Counter(row["kind"] for row in rows)
-        lines = format_table(["queries", *kinds], [(len(rows), *kinds.values())], 1 + len(kinds))
-        table = []
+        kinds = dict.fromkeys(row["kind"] for row in rows)
+        table, lines = [], []
         for name, times in (
             ("all", [row["first"] for row in rows]),
             *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
             ("second query", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
-                shown = (f"{seconds:.2f}" for seconds in np.percentile(times, [50, 95, 100]))
-                table.append((name, *shown))
-        heads = ["processor time", "median [s]", "95 % [s]", "most [s]"]
-        lines += ["", *format_table(heads, table, 4)]
+                table.append((name, len(times), *np.percentile(times, [50, 95, 100])))
+        heads = ["queries", "number:d", "processor time, median [s]:.2f", "95 %:.2f", "most:.2f"]
         ratios = [row["second"] / row["first"] for row in rows if "second" in row]
         gaps = [row["gap"] for row in rows if row.get("gap") is not None]
         if ratios:
-            lines += ["", f"Second over first: median {np.median(ratios):.3f}."]
+            lines.append(f"Second over first: median {np.median(ratios):.3f}.")
         if gaps:
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
-            lines += [f"{text}, median {100 * np.median(gaps):.2g} %."]
+            lines.append(f"{text}, median {100 * np.median(gaps):.2g} %.")
         solved = [row["ways"] for row in rows if "ways" in row]
-        if solved:
-            heads = ["", "carried out", "objective off: median", "most", "time: median", "95 %"]
-            lines += ["", *format_table(heads, filter(None, (_sum_up(w, solved) for w in WAYS)))]
+        carried = [*filter(None, (_sum_up(way, solved) for way in WAYS))]
+        heads_of_ways = ["", "carried out", "objective off, median:.2g", "most:.2g"]
+        heads_of_ways += ["time, median:.2f", "95 %:.2f"]
         tried = [(row, way, part) for row in rows for way, part in row.get("ways", {}).items()]
-        if refusals := [(row, way, part["why"]) for row, way, part in tried if part.get("why")]:
-            lines += ["", "Refused:", ""]
-            lines += [f"* {row['text']}, {way}: {why[:300]}" for row, way, why in refusals]
+        refusals = [
+            f"* {row['text']}, {way}: {part['why'][:300]}"
+            for row, way, part in tried
+            if part.get("why")
+        ]
         wrong = [row for row in rows if "findings" in row]
-        return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
+        parts: list[str | Table] = [Table(heads, table), "\n".join(lines)]
+        parts.append(Table(heads_of_ways, carried))
+        parts += ["Refused:", "\n".join(refusals)] if refusals else []
+        return parts, [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
 
 STUDY = Queries()
@@ -167,17 +168,17 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
     return row
 
 
-def _sum_up(way: str, solved: Sequence[Row]) -> list[str] | None:
+def _sum_up(way: str, solved: Sequence[Row]) -> list[Any] | None:
     """How many routes are carried out in a way, how far off, and in which time."""
     parts = [ways for ways in solved if way in ways]
     good = [ways for ways in parts if not ways[way].get("why")]
     off = [ways[way]["off"] for ways in good if "off" in ways[way]]
-    cells = [way, f"{len(good)} of {len(parts)}", *"----"]
+    cells: list[Any] = [way, f"{len(good)} of {len(parts)}", *[None] * 4]
     if off:
-        cells[2:4] = (f"{value:.2g}" for value in (np.median(off), max(off, key=abs)))
+        cells[2:4] = np.median(off), max(off, key=abs)
     if good:
         ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in good]
-        cells[4:] = (f"{value:.2f}" for value in np.percentile(ratios, [50, 95]))
+        cells[4:] = np.percentile(ratios, [50, 95])
     return cells if parts else None
 
 
@@ -236,7 +237,7 @@ def _draw_corners(rng: np.random.Generator, count: int) -> list[list[float]]:
     return [[float(x), float(y)] for x, y in corners.round(4)]
 
 
-def _draw_goal(rng: np.random.Generator, table: Table) -> Problem:
+def _draw_goal(rng: np.random.Generator, table: dict[str, Any]) -> Problem:
     """A problem from one drawn pose to another."""
     first = _draw_pose(rng, table)
     while (last := _draw_pose(rng, table)) == first:
@@ -244,7 +245,7 @@ def _draw_goal(rng: np.random.Generator, table: Table) -> Problem:
     return build_problem({**table, "start": first, "goal": last})
 
 
-def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
+def _draw_pose(rng: np.random.Generator, table: dict[str, Any]) -> dict[str, float]:
     count = len(table["object"]["vertices"])
     size = build_problem(table).scene.scales.length
     while True:

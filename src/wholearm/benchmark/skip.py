@@ -9,13 +9,14 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.document import Table
 from ..geometry.tracing import load, trace_phases
 from ..planning.nlp import record_runs
 from ..planning.options import PlanOptions
@@ -23,9 +24,9 @@ from ..planning.plan import solve
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
-from .study import Case, Row, Study, format_table
+from .study import Case, Findings, Row, Study
 
-COLUMNS = {"unknowns": "", "rows": "", "building": " [ms]", "solving": " [ms]"}  # with units
+COLUMNS = {"unknowns": "", "rows": "", "building": " [ms]", "solving": " [ms]"}  # units of tables
 
 
 class Skip(Study):
@@ -44,24 +45,21 @@ class Skip(Study):
         folder, part, having, _ = case
         return spend(list_pairs(folder)[part][having])
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Sizes, and medians of times."""
-        lines = [
-            "The same phases without a part of the model and with it. Sizes are those of the first",
-            "NLP, times those of the processor, as medians of fresh processes; building is all but",
-            "the solver.",
-            "",
-        ]
-        table = []
+        text = (
+            "The same phases without a part of the model and with it. Sizes are those of the first "
+            "NLP, times those of the processor, as medians of fresh processes; building is all but "
+            "the solver."
+        )
+        table = list[list[Any]]()
         for part in dict.fromkeys(row["case"][1] for row in rows):
-            cells = [part]
+            table.append([part])
             for column, having in product(COLUMNS, (False, True)):
                 group = [row for row in rows if row["case"][1:3] == [part, having]]
-                cells.append(f"{median(row[column] for row in group):.0f}")
-            table.append(cells)
-        firsts = (f"{name} without{unit}" for name, unit in COLUMNS.items())
-        lines += format_table(["part", *(h for first in firsts for h in (first, "with"))], table)
-        return "\n".join(lines), []
+                table[-1].append(median(row[column] for row in group))
+        heads = [(f"{name} without{unit}:.0f", f"with{unit}:.0f") for name, unit in COLUMNS.items()]
+        return [text, Table(["part", *chain(*heads)], table)], []
 
 
 STUDY = Skip()
@@ -128,7 +126,7 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
 
 
 def spend(plan: SkipPlan) -> Row:
-    """Sizes of the first NLP of a plan, and processor time outside and inside the solver [ms]."""
+    """Sizes of the first NLP of a plan, and processor time outside and inside the solver [s]."""
     problem, started = plan.problem, time.process_time()
     with record_runs() as runs:
         if plan.options.get("transcription") == "time":
@@ -142,4 +140,4 @@ def spend(plan: SkipPlan) -> Row:
         force_margins(solution).canvas.draw()
     whole, solving = time.process_time() - started, sum(run.seconds for run in runs)
     sizes = runs[0].unknowns, runs[0].rows
-    return dict(zip(COLUMNS, (*sizes, 1e3 * (whole - solving), 1e3 * solving), strict=True))
+    return dict(zip(COLUMNS, (*sizes, whole - solving, solving), strict=True))

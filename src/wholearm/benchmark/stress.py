@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..common.arrays import Array
+from ..common.document import Table
 from ..common.errors import ReplayError, SolverError, WholearmError
 from ..common.files import make_folder, write_text
 from ..geometry.tracing import check_phases, load
@@ -32,7 +33,7 @@ from ..verification.verify import verify
 from .damage import describe_error, run_file
 from .refusals import OVERLAP, clearances, judge
 from .scenes import DrawnScene, draw_case
-from .study import Case, Row, Study, format_table, name_case
+from .study import Case, Findings, Row, Study, name_case
 
 OBJECTIVES = ("time", "effort", "margin")
 SAME = 1e-6  # relative difference of two values that rounding may make
@@ -113,7 +114,7 @@ class Stress(Study):
             row["findings"] += _compare(row, _plan(noisy, objective))
         return {"kind": scene.kind, **row}
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Tables of each part, and every finding."""
         findings = [(name_case(row), *finding) for row in rows for finding in row["findings"]]
         findings += [
@@ -122,7 +123,7 @@ class Stress(Study):
             if "printed" in row
         ]
         findings += compare_values([row for row in rows if row["case"][0] == "problem"])
-        lines = []
+        parts = list[str | Table]()
         for kind, title, describe in (
             ("scene", "Generated scenes", _describe_scenes),
             ("file", "Damaged files", _describe_files),
@@ -130,11 +131,11 @@ class Stress(Study):
         ):
             mine = [row for row in rows if row["case"][0] == kind]
             if mine:
-                lines += [f"## {title}", "", *describe(mine), ""]
+                parts += [f"## {title}", *describe(mine)]
         counted = Counter(kind for _, kind, _ in findings)
         kinds = dict.fromkeys([*KINDS, *counted])
-        lines += format_table(["finding", "number"], [(kind, counted[kind]) for kind in kinds])
-        return "\n".join(lines), [f"{where}: {kind}: {text}" for where, kind, text in findings]
+        parts.append(Table(["finding", "number:d"], [(kind, counted[kind]) for kind in kinds]))
+        return parts, [f"{where}: {kind}: {text}" for where, kind, text in findings]
 
 
 STUDY = Stress()
@@ -222,13 +223,13 @@ def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
     return findings
 
 
-def _describe_scenes(rows: Sequence[Row]) -> list[str]:
+def _describe_scenes(rows: Sequence[Row]) -> list[Table]:
     verdicts = [row["verdict"] or "not judged" for row in rows if row["outcome"] == "refused"]
     seconds = np.array([row["seconds"] for row in rows])
     middle, most = np.percentile(seconds, [50, 95])
     text = f"median {middle:.2f} s, 95 % within {most:.2f} s, longest {seconds.max():.2f} s"
     about = [
-        ("scenes", len({row["case"][2] for row in rows})),
+        ("scenes", str(len({row["case"][2] for row in rows}))),
         ("answers, one for each objective", _count(row["outcome"] for row in rows)),
         ("refusals, looked at a second time", _count(verdicts)),
         ("processor time of an answer, planned twice and checked", text),
@@ -237,31 +238,28 @@ def _describe_scenes(rows: Sequence[Row]) -> list[str]:
     kinds = Counter((row["kind"], row["outcome"]) for row in rows)
     names = sorted({row["kind"] for row in rows})
     counts = [(kind, *(kinds[kind, outcome] for outcome in outcomes)) for kind in names]
-    return [
-        *format_table(["", ""], about, 2),
-        "",
-        *format_table(["kind of scene", *outcomes], counts),
-    ]
+    heads = ["kind of scene", *(f"{outcome}:d" for outcome in outcomes)]
+    return [Table(["", ""], about), Table(heads, counts)]
 
 
-def _describe_files(rows: Sequence[Row]) -> list[str]:
+def _describe_files(rows: Sequence[Row]) -> list[Table]:
     statuses = dict[str, list[str]]()
     for row in sorted(rows, key=lambda row: str(row["kind"])):
         statuses.setdefault(row["kind"], []).append(str(row["status"]))
     table = [(kind, len(mine), _count(mine)) for kind, mine in statuses.items()]
-    return format_table(["files", "number", "exit status"], table)
+    return [Table(["files", "number:d", "exit status"], table)]
 
 
-def _describe_trials(rows: Sequence[Row]) -> list[str]:
+def _describe_trials(rows: Sequence[Row]) -> list[Table]:
     table = []
     for path, objective in dict.fromkeys(tuple(row["case"][1:3]) for row in rows):
         mine = [row for row in rows if row["case"][1:3] == [path, objective]]
         good = sum(not row["findings"] for row in mine)
         values = [row["value"] for row in mine if row["case"][3] == "noise" and row["value"]]
-        apart = f"{np.ptp(values) / np.abs(values).max():.1e}" if values else ""
+        apart = np.ptp(values) / np.abs(values).max() if values else None
         table.append((os.path.basename(path), objective, len(mine), good, apart))
-    heads = ["problem", "objective", "trials", "without a finding", "values apart under noise"]
-    return format_table(heads, table, 2)
+    heads = ["problem", "objective", "trials:d", "without a finding:d"]
+    return [Table([*heads, "values apart under noise:.1e"], table)]
 
 
 def _count(names: Iterable[str]) -> str:

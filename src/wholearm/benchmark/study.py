@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from .. import __version__
+from ..common.document import Document, Table
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
 from ..common.parallel import Processes, run_all
@@ -41,6 +42,7 @@ Row = dict[str, Any]
 Added are `case`, the `seconds` of processor time, and `memory`, by which it has raised the peak of
 its process [MB].
 """
+Findings = tuple[Sequence[str | Table], list[str]]
 PACKAGES = ("casadi", "numpy", "scipy")
 
 
@@ -103,8 +105,8 @@ class Study:
         """Run one case, in another process."""
         raise NotImplementedError
 
-    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
-        """The table in Markdown, and what must not be; cases that have failed are not in `rows`."""
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
+        """Texts and tables, and what must not be; cases that have failed are not in `rows`."""
         raise NotImplementedError
 
     def draw(self, rows: Sequence[Row]) -> Figure | None:
@@ -160,14 +162,13 @@ def run_study(
             progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
     rows = [done[case] for case in cases]
     good = [row for row in rows if "failed" not in row]
-    body, violations = study.report(good, options)
-    findings = [
-        f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row
-    ] + violations
-    parts = [f"# {study.title}", describe_machine(study.packages), body.strip()]
+    parts, violations = study.report(good, options)
+    findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row]
+    findings += violations
+    parts = [describe_machine(study.packages), *parts]
     if findings:
-        parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
-    text = "\n\n".join(parts) + "\n"
+        parts += ["## Findings", "\n".join(f"* {text}" for text in findings)]
+    text = Document(study.title, parts=parts).to_markdown()
     written = [f"{stem}.md"]
     with together():
         write_text(written[0], text)
@@ -202,16 +203,6 @@ def describe_machine(packages: Sequence[str] = ()) -> str:
         match = re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.M)
         processor = match[1].strip() if match else processor
     return ", ".join([*parts, processor, f"{os.cpu_count()} cores"])
-
-
-def format_table(
-    heads: Sequence[str], rows: Iterable[Sequence[object]], left: int = 1
-) -> list[str]:
-    """Lines of a table in Markdown, whose first columns are aligned to the left."""
-    marks = ["---" if k < left else "---:" for k in range(len(heads))]
-    cells = [heads, *rows]
-    lines = [f"| {' | '.join(map(str, row))} |" for row in cells]
-    return [lines[0], f"|{'|'.join(marks)}|", *lines[1:]]
 
 
 def digest_source(inputs: Iterable[Path] = ()) -> str:

@@ -174,6 +174,11 @@ class Document(NamedTuple):
             blocks, lines = [*blocks, part.to_text()], []
         return "\n\n".join([*blocks, *(["\n".join(lines)] if lines else [])])
 
+    def to_markdown(self) -> str:
+        """A page of Markdown."""
+        blocks = (part if isinstance(part, str) else part.to_markdown() for part in self.shown)
+        return "\n\n".join([f"# {self.title}", *blocks]) + "\n"
+
     def to_html(self) -> str:
         """Paragraphs and tables of HTML; of class ``ok`` or ``bad`` as the verdict is."""
         look = {"": "", "ok": ' class="ok"'}.get(self.verdict, ' class="bad"')

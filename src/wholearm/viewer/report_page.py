@@ -256,5 +256,5 @@ def write_gallery(
         "torques as arcs at the joints."
     )
     heads = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f"]
-    table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows).to_markdown()
-    write_text(path, "\n\n".join(["# Gallery", text, table, *pictures]) + "\n")
+    table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows)
+    write_text(path, Document("Gallery", parts=[text, table, *pictures]).to_markdown())
