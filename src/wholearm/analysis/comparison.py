@@ -130,9 +130,7 @@ def compare(
     ----------
     progress  told which of them is replayed
 
-    Raises
-    ------
-    InputError  if a file cannot be read, or a trajectory is one of another problem; names the file
+    InputError if a file cannot be read, or a trajectory is one of another problem; names the file.
     """
     short = [os.path.basename(path) for path in paths]
     names = short if len({*short}) == len(short) else paths

@@ -54,10 +54,8 @@ def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:
 class Uncertainty:
     """Half widths of the ranges, by name of the parameter, and how torques are carried out.
 
-    Raises
-    ------
-    InputError  if a name is unknown, or a width is not a number from zero to what makes sense:
-                below one for relative ones
+    InputError if a name is unknown, or a width is not a number from zero to what makes sense: below
+    one for relative ones.
     """
 
     # those that are left out have their defaults; zero leaves a parameter as it is
@@ -219,9 +217,7 @@ class Trial:
     ) -> FreeSimulation:
         """Replay torques in the scene whose numbers are off, free of assumptions.
 
-        Raises
-        ------
-        InputError, SimulationError  if the changed scene has no start
+        InputError, SimulationError if the changed scene has no start.
         """
         problem = change_problem(self.problem, changes)
         x = self.state[:1] + changes.get("start_x", 0.0)
@@ -298,10 +294,8 @@ def make_trial(
 ) -> Trial:
     """What is tried of a plan: all of it, or the phase of a number, by a policy if one is given.
 
-    Raises
-    ------
-    InputError  if the plan has no phase of that number, or one that does not start at rest; or the
-                policy has other phases
+    InputError if the plan has no phase of that number, or one that does not start at rest; or the
+    policy has other phases.
     """
     starts = plan.phase_starts
     count = len(starts) - 1
@@ -475,10 +469,8 @@ def assess_robustness(
     fresh        begin the file anew, whatever it holds
     start        makes a `concurrent.futures.Executor`; processes on all cores if left out
 
-    Raises
-    ------
-    InputError  if the plan has no such phase, or the file holds another study or anything else, is
-                being written by another run, or cannot be written
+    InputError if the plan has no such phase, or the file holds another study or anything else, is
+    being written by another run, or cannot be written.
     """
     problem, trajectory = adopt_motion(problem, plan)
     Range(1, 10**6).read(samples, "samples")

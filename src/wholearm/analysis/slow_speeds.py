@@ -58,9 +58,7 @@ def predict(
               torques that keep a normal force that far between.
     progress  called with the phase that is predicted
 
-    Raises
-    ------
-    InputError  if the phases cannot be carried out geometrically, or a number is out of its range
+    InputError if the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
     share = SHARE.read(squeeze, "squeeze")
@@ -88,9 +86,7 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
     ----------
     speed : [m/s]  along the phases
 
-    Raises
-    ------
-    InfeasibleError  if a phase has no quasistatic torques
+    InfeasibleError if a phase has no quasistatic torques.
     """
     speed, start = require_number(speed, "speed", positive=True), 0.0
     times, rows = [], []
@@ -360,9 +356,7 @@ class PathSamples:
 def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples | None:
     """The path of a phase that starts at `z`, shape (5,); None with other than 1 or 2 freedoms.
 
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, or the end cannot be reached
+    InputError if the contacts do not touch at `z`, or the end cannot be reached.
     """
     formation = phase.formation
     curve = None

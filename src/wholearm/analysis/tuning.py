@@ -409,9 +409,7 @@ class Tuning(Result):
     def to_csv(self) -> str:
         """The torques as a table, with how many simulations they took and what was done.
 
-        Raises
-        ------
-        ValueError  if there are none
+        ValueError if there are none.
         """
         if self.rows is None:
             raise ValueError("no torques were found")
@@ -465,9 +463,7 @@ def tune(
               last that keeps every contact, 1
     progress  shown each trial, in words
 
-    Raises
-    ------
-    InputError  if the phases cannot be carried out geometrically, or a number is out of its range
+    InputError if the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
     squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")

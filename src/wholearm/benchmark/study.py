@@ -7,9 +7,7 @@ as they end, goes on where it was stopped, and writes the table with versions an
 from __future__ import annotations
 
 import argparse
-import csv
 import hashlib
-import io
 import json
 import os
 import platform
@@ -27,7 +25,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from .. import __version__
-from ..common.document import Document, Table
+from ..common.document import Document, Table, format_csv
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
 from ..common.parallel import Processes, run_all
@@ -47,47 +45,30 @@ PACKAGES = ("casadi", "numpy", "scipy")
 
 
 class Study:
-    """Cases, a run of one of them, and a table.
+    """Cases, a run of one of them, and a table."""
 
-    Attributes
-    ----------
-    name          of its files: ``bench_NAME.jsonl``, ``.md`` and ``.csv``
-    title         of the table
-    folder        where, if the command line does not say
-    of_code       whether records count for the source code and the machine alone that they were
-                  made with
-    timed, alone  whether cases are run one at a time, and each in a process of its own
-    strict        whether warnings are errors
-    shipped       whether it reads a folder of problem files
-    seeded        whether cases are drawn from a seed
-    """
-
-    name = ""
-    title = ""
-    folder = "results"
-    of_code = False
-    timed = False
-    alone = False
-    strict = False
-    shipped = seeded = False
+    name = title = ""  # of its files, ``bench_NAME.jsonl``, ``.md`` and ``.csv``; of the table
+    folder = "results"  # where, if the command line does not say
+    of_code = False  # whether records count only for the source code and machine they are of
+    timed = alone = False  # whether cases are run one at a time, and each in a process of its own
+    strict = False  # whether warnings are errors
+    shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
     packages: tuple[str, ...] = ()  # further ones whose versions are stated
-
     options = ""  # table of options beside those that every study has, as of `read_options`
 
     def list_options(self) -> str:
         """The table of all options."""
-        parts = [self.options]
-        if not self.timed:
-            parts.append("--jobs N  processes (as many as cores) in 1..256\n")
-        if self.shipped:
-            parts.append("--problems DIR  folder of problem files = problems\n")
-        if self.seeded:
-            parts.append(f"--seed K  of everything drawn = 0 in 0..{2**63}\n")
-        parts.append("--fresh  run all cases anew, whatever records the folder has\n")
-        parts.append("--again  run again the cases that had findings\n")
-        parts.append(f"-o --output DIR  folder for records and tables = {self.folder}\n")
-        return "".join(parts)
+        parts = {
+            self.options: True,
+            "--jobs N  processes (as many as cores) in 1..256\n": not self.timed,
+            "--problems DIR  folder of problem files = problems\n": self.shipped,
+            f"--seed K  of everything drawn = 0 in 0..{2**63}\n": self.seeded,
+            "--fresh  run all cases anew, whatever records the folder has\n": True,
+            "--again  run again the cases that had findings\n": True,
+            f"-o --output DIR  folder for records and tables = {self.folder}\n": True,
+        }
+        return "".join(text for text, has in parts.items() if has)
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
         """What records belong to, beside study and version: a seed, for example."""
@@ -143,8 +124,8 @@ def run_study(
             same = header.get("source") == stamp["source"]
             fresh = fresh or (header.get("study") == study.name and not same)
     with Journal(path, stamp, fresh, options.again) as journal:
-        done = {_key(row["case"]): row for row in journal.records}
-        left = [case for case in cases if case not in done]
+        done = {json.dumps(row["case"]): row for row in journal.records}
+        left = [case for case in cases if json.dumps(case) not in done]
         wall_start, wrong = time.monotonic(), 0
         # Each process has one thread of OpenBLAS.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -153,14 +134,13 @@ def run_study(
         answers = run_all(partial(measure_case, study), left, pool, jobs)
         for count, (case, answer) in enumerate(answers, start=1):
             row = _fail(str(answer)) if isinstance(answer, Exception) else answer
-            row = {"case": list(case), **row}
+            done[json.dumps(case)] = row = {"case": list(case), **row}
             journal.add(row)
-            done[case] = row
             wrong += bool(row.get("findings"))
             ahead = (time.monotonic() - wall_start) / count * (len(left) - count) / 60
             text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
             progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
-    rows = [done[case] for case in cases]
+    rows = [done[json.dumps(case)] for case in cases]
     good = [row for row in rows if "failed" not in row]
     parts, violations = study.report(good, options)
     findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row]
@@ -174,13 +154,7 @@ def run_study(
         write_text(written[0], text)
         if study.columns:
             written.append(f"{stem}.csv")
-            table = io.StringIO()
-            writer = csv.DictWriter(
-                table, study.columns, extrasaction="ignore", lineterminator="\n"
-            )
-            writer.writeheader()
-            writer.writerows(rows)
-            write_text(written[-1], table.getvalue())
+            write_text(written[-1], format_csv(rows, study.columns))
         figure = study.draw(good)
         if figure is not None:
             from ..figures.plots import save
@@ -264,8 +238,3 @@ def find_peak() -> float:
     # Where there is `/proc`, the other figure starts from that of the parent.
     (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
     return int(peak) * 1024 / 1e6
-
-
-def _key(case: Any) -> Any:
-    """A case as it was before it was written."""
-    return tuple(map(_key, case)) if isinstance(case, list | tuple) else case

@@ -579,9 +579,7 @@ def tell_origin(
     -------
     dict  the lines as `notes`, for JSON; empty if there are none
 
-    Raises
-    ------
-    InputError  if one of them makes no sense for the problem; names its file
+    InputError if one of them makes no sense for the problem; names its file.
     """
     from ..results.adopt import describe_origin
 

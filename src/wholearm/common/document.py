@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -40,9 +41,7 @@ def restore(kind: Any, value: Any) -> Any:
     Types are named tuples, dataclasses, numbers, text, and tuples, mappings and optional ones of
     these. What is missing is as by default; what a type has `derived` is left out.
 
-    Raises
-    ------
-    TypeError, ValueError, AttributeError  if it is none of this type
+    TypeError, ValueError, AttributeError if it is none of this type.
     """
     origin, parts = get_origin(kind), get_args(kind)
     if type(None) in parts:
@@ -188,6 +187,15 @@ class Document(NamedTuple):
             for part in self.shown
         ]
         return "\n".join(parts)
+
+
+def format_csv(rows: Iterable[Mapping[str, Any]], heads: Iterable[str]) -> str:
+    """Entries of rows by their heads as CSV, with all digits."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(heads), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 class Brief:

@@ -29,10 +29,8 @@ class Journal:
     fresh  begin the file anew, whatever it holds
     again  drop records with findings, so that their tasks are run again
 
-    Raises
-    ------
-    InputError  if the file holds something else, another study of the same kind included, or is
-                being written by another run, or cannot be written
+    InputError if the file holds something else, another study of the same kind included, or is
+    being written by another run, or cannot be written.
     """
 
     def __init__(

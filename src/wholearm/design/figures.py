@@ -39,9 +39,7 @@ def choose_axes(
 ) -> tuple[list[str], list[str]]:
     """Names of the parameters that are axes, and of those that lines or panels are for.
 
-    Raises
-    ------
-    InputError  if a grid has more than three parameters, or there are too many panels
+    InputError if a grid has more than three parameters, or there are too many panels.
     """
     several = [name for name, values in vary.items() if len(values) > 1]
     numeric = [k for k in several if all(type(v) in (int, float) for v in vary[k])]
@@ -61,9 +59,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
     Over one parameter, problems and words are lines; over two they are panels. Samples have a panel
     for each parameter.
 
-    Raises
-    ------
-    InputError  as `choose_axes`
+    InputError as `choose_axes`.
     """
     shown, fixed = choose_axes(sweep.vary, sweep.samples, len(sweep.problems))
     lines = dict[str, list[Row]]()

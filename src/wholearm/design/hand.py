@@ -57,10 +57,8 @@ def read_choices(problem: Problem, texts: Sequence[str], symmetric: bool = False
 
     In a symmetric hand what is said of one finger holds for the other, mirrored at x = 0.
 
-    Raises
-    ------
-    InputError  if the problem has no such number, a file may not have LOW or HIGH, these are in the
-                wrong order, or a number is chosen twice
+    InputError if the problem has no such number, a file may not have LOW or HIGH, these are in the
+    wrong order, or a number is chosen twice.
     """
     choices, taken = list[Choice](), set[str]()
     for text in texts:
@@ -253,10 +251,8 @@ def design_hand(
     jobs       processes; as many as cores if left out
     **options  as `wholearm.solve` takes them, such as `robust`
 
-    Raises
-    ------
-    InputError       if a problem lacks a number, or a file may not have its range
-    InfeasibleError  if no hand has a plan; says why most have none
+    InputError if a problem lacks a number, or a file may not have its range; InfeasibleError if no
+    hand has a plan; says why most have none.
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     choice("time", "effort", "-margin").read(minimise, "--minimise")

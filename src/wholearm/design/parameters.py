@@ -59,9 +59,7 @@ def list_parameters(problem: Problem) -> list[Parameter]:
 def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
     """The parameter that a name stands for; `label` is the option that it is from.
 
-    Raises
-    ------
-    InputError  if the problem has none of this name; tells the nearest one
+    InputError if the problem has none of this name; tells the nearest one.
     """
     every = _find_every(problem)
     if name in every:

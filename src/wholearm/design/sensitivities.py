@@ -305,10 +305,8 @@ def find_sensitivities(
     jobs         processes; as many as cores if left out
     multipliers  whether to use them where that is possible, or differences alone
 
-    Raises
-    ------
-    InputError  if the problem has no number of a name
-    InfeasibleError, SolverError  if the problem itself has no plan
+    InputError if the problem has no number of a name; InfeasibleError, SolverError if the problem
+    itself has no plan.
     """
     options = options or PlanOptions()
     options = replace(options, accuracy=min(options.accuracy, ACCURACY))

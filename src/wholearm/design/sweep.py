@@ -6,8 +6,6 @@ kept one by one in a `Journal` and go through an executor, like samples of `anal
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import os
@@ -26,7 +24,7 @@ import numpy as np
 
 from .. import __version__
 from ..analysis.robustness import draw_cube
-from ..common.document import Document, Result, Table, plain
+from ..common.document import Document, Result, Table, format_csv, plain
 from ..common.errors import InfeasibleError, InputError, WholearmError, require_number
 from ..common.fields import Range, choice
 from ..common.journal import Journal
@@ -201,12 +199,8 @@ class Sweep(Result):
 
     def to_csv(self) -> str:
         """All rows as CSV, with all digits."""
-        stream = io.StringIO()
-        heads = dict.fromkeys(key for row in sorted(self.rows, key=len)[::-1] for key in row)
-        writer = csv.DictWriter(stream, heads, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        return stream.getvalue()
+        keys = (key for row in sorted(self.rows, key=len)[::-1] for key in row)
+        return format_csv(self.rows, dict.fromkeys(keys))
 
 
 def show_value(value: Any) -> str:
@@ -220,9 +214,7 @@ def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ..
 
     Samples take ``NAME=LOW:HIGH``. Values that are no numbers are words.
 
-    Raises
-    ------
-    InputError  if a text is none of these, or a name is given twice
+    InputError if a text is none of these, or a name is given twice.
     """
     vary = dict[str, tuple[Any, ...]]()
     form = "NAME=LOW:HIGH" if samples else "NAME=LOW:HIGH:COUNT or NAME=VALUE,VALUE"
@@ -296,10 +288,8 @@ def sweep(
     progress         told how many points are done, and the time that is left
     **options        as `wholearm.solve` takes them
 
-    Raises
-    ------
-    InputError  if a problem lacks a parameter, no file may have one of its values, or the file
-                holds another sweep or anything else
+    InputError if a problem lacks a parameter, no file may have one of its values, or the file holds
+    another sweep or anything else.
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     for check in checks:

@@ -227,10 +227,8 @@ def replay_in(
     allowed    error of the pose, over the scene's length and in rad; by default that of `ENGINES`
     halvings   number of halvings of the step, with harder contacts and with the same
 
-    Raises
-    ------
-    InputError  if the engine is unknown or not installed, the plan is of other phases, or a link
-                has no thickness
+    InputError if the engine is unknown or not installed, the plan is of other phases, or a link has
+    no thickness.
     """
     play = require_engine(engine)
     info = ENGINES[engine]
@@ -435,9 +433,7 @@ def play_policy(
     whole                       from start to end; otherwise from each phase that begins at rest
     setting, allowed, progress  as of `replay_in`
 
-    Raises
-    ------
-    InputError  if the engine is unknown or not installed, or the policy is of other phases
+    InputError if the engine is unknown or not installed, or the policy is of other phases.
     """
     problem, plan = adopt_motion(problem, plan)
     play = require_engine(engine)

@@ -69,9 +69,7 @@ def write_mjcf(
     step : [s]  `STEP` of the scene's time when left out
     softness    factor of the time constants of contacts
 
-    Raises
-    ------
-    InputError  if a link has no thickness
+    InputError if a link has no thickness.
     """
     scene, home = problem.scene, problem.start
     if plan is not None:

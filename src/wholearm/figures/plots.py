@@ -257,10 +257,8 @@ def force_margins(
     Figure  axes in the order: snapshots from left to right, margins, torques, the friction cones if
             a contact rolls, and pose, angles and speeds
 
-    Raises
-    ------
-    InputError  if its `meta` lacks the problem, torques alone are given, or the width is out of its
-                range
+    InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
+    range.
     """
     _, trajectory = narrow(what)
     if trajectory is None:

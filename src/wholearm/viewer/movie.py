@@ -132,9 +132,7 @@ class Movie:
     speed       how fast the motion passes, over real time
     resolution  dots per inch; it is 8 inches wide
 
-    Raises
-    ------
-    InputError  if `speed` is not positive, or makes the movie longer than two minutes
+    InputError if `speed` is not positive, or makes the movie longer than two minutes.
     """
 
     def __init__(
@@ -199,9 +197,7 @@ def write_movie(
 ) -> None:
     """Write a movie as GIF, or as MP4 by ffmpeg.
 
-    Raises
-    ------
-    InputError  if there is no ffmpeg for an MP4, or the file cannot be written
+    InputError if there is no ffmpeg for an MP4, or the file cannot be written.
     """
 
     def draw() -> Iterator[Array]:

@@ -53,9 +53,7 @@ def build_report(
     chart     the map of the problem, if it is there already
     sensitivities  whether to add what 1 % more of each number is worth
 
-    Raises
-    ------
-    InputError  if a file cannot be read, or is one of another problem; names the file
+    InputError if a file cannot be read, or is one of another problem; names the file.
     """
     from .. import __version__
 
@@ -226,9 +224,7 @@ def write_gallery(
 
     Figures and movies, which last 2 s, go to a folder beside the page that has its name.
 
-    Raises
-    ------
-    WholearmError  if a problem cannot be read or planned; the page is written only if all are
+    WholearmError if a problem cannot be read or planned; the page is written only if all are.
     """
     folder = os.path.splitext(path)[0]
     make_folder(folder)
