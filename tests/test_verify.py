@@ -171,7 +171,7 @@ def alter(motion: Motion, field: str, change: Array | float) -> Any:
         ("c_t", np.array([0.0, 0.0, 1e-3, 0.0]), "v6-finger2 is not Coulomb's for its sliding"),
         ("c_t", np.array([0.0, 0.0, 10.0, 0.0]), "v6-finger2 is not Coulomb's for its sliding"),
         ("z", np.array([0.0, -1e-5, 0.0, 0.0, 0.0]), "object and palm overlap"),
-        ("z", np.array([0.0, 1e-5, 0.0, 0.0, 0.0]), "gap of v1-palm"),
+        ("z", np.array([0.0, 1e-5, 0.0, 0.0, 0.0]), "equation of motion of finger 1 misses"),
         ("z_dot", np.array([0.01, 0.0, 0.0, 0.0, 0.0]), "z and its rate differ"),
         ("z_ddot", np.array([1.0, 0.0, 0.0, 0.0, 0.0]), "z' and its rate differ"),
         ("c_n", -0.2, "short of epsilon"),

@@ -46,32 +46,15 @@ if TYPE_CHECKING:
 
 
 TOPICS = {
-    "python": "",
-    "file-format": "problem",
-    "model": "mechanics",
-    "contacts": "contacts",
-    "planning": "planning",
-    "path-domain": "planning/path_domain",
-    "time-domain": "planning/time_domain",
-    "robust-plans": "planning/robust",
-    "verification": "verification",
-    "messages": "cli",
-    "search": "search",
-    "map": "mapping",
-    "policy": "policy",
-    "robustness": "analysis",
-    "engines": "engines",
-    "design": "design",
-    "slow-motions": "analysis",
-    "tuning": "analysis",
-    "comparison": "analysis",
-    "simulation": "simulation",
-    "free-simulation": "simulation",
-    "output-files": "results",
-    "figures": "figures",
-    "movies": "viewer",
-    "studies": "benchmark",
-}
+    "python": "", "file-format": "problem", "model": "mechanics", "contacts": "contacts",
+    "planning": "planning", "path-domain": "planning/path_domain",
+    "time-domain": "planning/time_domain", "robust-plans": "planning/robust",
+    "verification": "verification", "messages": "cli", "search": "search", "map": "mapping",
+    "policy": "policy", "robustness": "analysis", "engines": "engines", "design": "design",
+    "slow-motions": "analysis", "tuning": "analysis", "comparison": "analysis",
+    "simulation": "simulation", "free-simulation": "simulation", "output-files": "results",
+    "figures": "figures", "movies": "viewer", "studies": "benchmark",
+}  # fmt: skip
 """Folder of the page of each topic."""
 
 SIMULATORS = ("told", "free")  # what `--simulate` takes; the first one if it is left out
@@ -362,18 +345,13 @@ class Parser(argparse.ArgumentParser):
         raise InputError("", "", f"{text}; see {self.prog} --help")
 
 
-def add_parser(parsers: Any, name: str, text: str) -> Parser:
-    """Add the parser of a command or study that is for what the text says."""
-    parser: Parser = parsers.add_parser(
-        name, help=text, description=f"{text[0].upper()}{text[1:]}."
-    )
-    return parser
-
-
-def add_options(parser: argparse.ArgumentParser, table: str) -> None:
-    """Give options and files of a table, as of `read_options`, to a parser."""
+def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
+    """Add the parser of a command or study: what it is for, options and files (`read_options`)."""
+    title = f"{text[0].upper()}{text[1:]}."
+    parser: Parser = parsers.add_parser(name, help=text, description=title)
     for option in read_options(table):
         option.add(parser)
+    return parser
 
 
 def build_parser(given: Sequence[str] | None = None) -> Parser:
@@ -385,8 +363,7 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
     for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
         head, _, table = part.partition("\n")
         name, run, text = re.split(r" {2,}", head)
-        subparser = add_parser(commands, name.strip("[]"), text)
-        add_options(subparser, table)
+        subparser = add_parser(commands, name.strip("[]"), text, table)
         subparser.set_defaults(run=globals()[run])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
@@ -397,11 +374,12 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
 
         studies = bench.add_subparsers(metavar="STUDY")
         for name, text in STUDIES.items():
-            subparser = add_parser(studies, name, text)
             if given is None or name in given[1:2]:
                 study = load_study(name)
-                add_options(subparser, study.list_options())
+                subparser = add_parser(studies, name, text, study.list_options())
                 subparser.set_defaults(run=partial(_run_study, study))
+            else:
+                add_parser(studies, name, text)
     return parser
 
 
@@ -497,10 +475,7 @@ def finish(
     *paths: str | None,
     notes: Mapping[str, Any] | None = None,
 ) -> int:
-    """Print a result as text, or with --json and with notes as JSON, and which files are written.
-
-    Returns the exit status.
-    """
+    """Print a result as text or JSON with notes, and files that are written; the exit status."""
     clear_progress()
     as_json = getattr(options, "json", False)
     if result is not None and as_json:
@@ -546,14 +521,10 @@ def read_problem(options: argparse.Namespace) -> wholearm.Problem:
 LoadedPlan = tuple[
     "wholearm.Problem", "wholearm.Trajectory", "wholearm.Policy | None", dict[str, list[str]]
 ]
-"""A problem with the phases of a plan, the plan, its policy if one is given, and notes."""
 
 
 def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> LoadedPlan:
-    """The problem of a command with the phases of a plan, the plan, its policy, and notes.
-
-    The policy is none where none is given, the notes as of `tell_origin`.
-    """
+    """The problem with the phases of a plan, the plan, its policy if any, and `tell_origin`."""
     from ..problem.read import adopt_phases
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
@@ -568,18 +539,10 @@ def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> L
 def tell_origin(
     problem: wholearm.Problem, *origins: tuple[str, str, Mapping[str, Any]], silent: bool = False
 ) -> dict[str, list[str]]:
-    """Print a line for what was made for another problem.
+    """Print, unless `silent`, and return a line for what was made for another problem.
 
-    Parameters
-    ----------
-    origins  what it is, its file, and what that says about it
-    silent   leave printing to the caller
-
-    Returns
-    -------
-    dict  the lines as `notes`, for JSON; empty if there are none
-
-    InputError if one of them makes no sense for the problem; names its file.
+    Origins are what it is, its file, and what that says about it. The lines are the `notes`, for
+    JSON; without any the dict is empty. InputError, with the file, if one makes no sense here.
     """
     from ..results.adopt import describe_origin
 
@@ -602,7 +565,7 @@ def solve(options: argparse.Namespace) -> int:
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
-    _check_sampling(options)
+    make_table = _choose_table(options)
     problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
@@ -616,7 +579,7 @@ def solve(options: argparse.Namespace) -> int:
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
-        table = None if options.torques is None else _make_table(options, plan)
+        table = None if make_table is None else make_table(plan)
     except WholearmError as error:
         clear_progress()
         # Of bad input one line says everything.
@@ -638,28 +601,22 @@ def solve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check_sampling(options: argparse.Namespace) -> None:
-    """Check what is asked of a table before anything is planned for it."""
-    if options.sample_rate is None:
-        if options.interpolation is not None:
-            raise InputError("", "--interpolation", "is for tables with a --sample-rate")
-        return
+def _choose_table(options: argparse.Namespace) -> Callable[[wholearm.Plan], TorqueTable] | None:
+    """What makes the torque table of a plan, checked before anything is planned; None for none."""
+    rate, interpolation = options.sample_rate, options.interpolation or "linear"
+    if rate is None and options.interpolation is not None:
+        raise InputError("", "--interpolation", "is for tables with a --sample-rate")
     if options.torques is None:
-        raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
+        if rate is not None:
+            raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
+        return None
+    from ..planning import replay_check
     from ..results.torque import require_sampling
 
-    require_sampling(options.sample_rate, options.interpolation or "linear")
-
-
-def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
-    """The torque table that is asked for, replayed."""
-    from ..planning.replay_check import make_table, sample_table
-
-    arguments = plan.problem, plan.trajectory
-    if options.sample_rate is None:
-        return make_table(*arguments, options.replay)
-    interpolation = options.interpolation or "linear"
-    return sample_table(*arguments, options.sample_rate, interpolation, options.replay)
+    if rate is None:
+        return lambda plan: replay_check.make_table(plan.problem, plan.trajectory, options.replay)
+    sampling = require_sampling(rate, interpolation), interpolation, options.replay
+    return lambda plan: replay_check.sample_table(plan.problem, plan.trajectory, *sampling)
 
 
 def verify(options: argparse.Namespace) -> int:
@@ -851,9 +808,13 @@ def find_route(
     """Find a route, with a progress line, in two processes if nothing else is asked for."""
     from ..common.parallel import count_cores
 
+    def warn(message: Warning | str, *_: object, **__: object) -> None:
+        clear_progress()
+        _complain(f"warning: {message}")
+
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = _warn
+        warnings.showwarning = warn
         return wholearm.find_route(
             problem,
             **list_given(options, "cache", "time_limit", *keys_of(wholearm.PlanOptions)),
@@ -862,11 +823,6 @@ def find_route(
             jobs=min(2, count_cores()) if options.jobs is None else options.jobs,
             hurry=hasten,
         )
-
-
-def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    clear_progress()
-    _complain(f"warning: {message}")
 
 
 def hasten() -> None:
@@ -1276,11 +1232,10 @@ def load_study(name: str) -> Study:
 
 
 def _list_studies(options: argparse.Namespace) -> int:
-    """Print the names of all studies, with a line each."""
     from ..benchmark import STUDIES
 
-    width = max(map(len, STUDIES))
-    print("\n".join(f"{name:{width}}  {text}" for name, text in STUDIES.items()))
+    for name, text in STUDIES.items():
+        print(f"{name:{max(map(len, STUDIES))}}  {text}")
     return 0
 
 
@@ -1289,7 +1244,5 @@ def _run_study(study: Study, options: argparse.Namespace) -> int:
 
     text, findings, written = run_study(study, options, show_progress())
     clear_progress()
-    print(text, end="")
-    for path in written:
-        print(f"wrote {path}")
+    print(text, *(f"wrote {path}\n" for path in written), sep="", end="")
     return 1 if findings else 0
