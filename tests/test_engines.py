@@ -24,7 +24,7 @@ from wholearm.engines.engine_replay import (
     play_policy,
     replay_in,
 )
-from wholearm.engines.stretch import (
+from wholearm.engines.interface import (
     EngineRun,
     Setting,
     find_between,

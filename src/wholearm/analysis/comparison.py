@@ -126,9 +126,7 @@ def compare(
 ) -> Comparison:
     """Replay trajectory files (.npz) and torques (.csv) for a problem, and compare them.
 
-    Parameters
-    ----------
-    progress  told which of them is replayed
+    `progress` is told which of them is replayed.
 
     InputError if a file cannot be read, or a trajectory is one of another problem; names the file.
     """

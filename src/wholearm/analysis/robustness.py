@@ -168,12 +168,10 @@ class Trial:
     def run(self, task: Task) -> dict[str, Any]:
         """What becomes of one sample, by number a row of `Uncertainty.draw`, as plain values.
 
-        Returns
-        -------
-        dict  `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
-              contact that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n
-              [N] of planned contacts; `path`, poses at even times, of the first 200, as many as
-              figures need; `ended`, empty or why the simulation ended early or could not begin
+        These are `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
+        contact that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n [N]
+        of planned contacts; `path`, poses at even times, of the first 200, as many as figures need;
+        `ended`, empty or why the simulation ended early or could not begin.
         """
         number, (*sample, offset) = task
         names = [parameter.name for parameter in self.uncertainty.varied]

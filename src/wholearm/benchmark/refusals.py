@@ -88,9 +88,7 @@ def project(
 ) -> Array | None:
     """Nearest zero of equations to `z`, by Newton's method; None if none.
 
-    Parameters
-    ----------
-    equations  their values, shape (m,), and rows of their Jacobian, (m, 5)
+    `equations` gives their values, shape (m,), and rows of their Jacobian, (m, 5).
     """
     scale, size = np.sqrt(weights(scene)), scene.scales.length
     for _ in range(20):
@@ -406,14 +404,9 @@ STILL = 1e-9  # rate over the largest one below which something stands still
 def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool = False) -> float:
     """Best margin of any motion that leaves rest at `z`, shape (5,), or comes to rest there.
 
-    Parameters
-    ----------
-    ends  whether the motion ends there: then things moved against their accelerations
-
-    Returns
-    -------
-    float  of normal forces over the weight and of torques over their limits, at most 1; NaN with
-           other than one or two freedoms
+    Where a motion `ends`, things moved against their accelerations. The margin is that of normal
+    forces over the weight and of torques over their limits, at most 1; NaN with other than one or
+    two freedoms.
     """
     touches = [locate(scene, name, z[None]) for name in phase.formation.names]
     rolling = phase.formation.rolling_rows

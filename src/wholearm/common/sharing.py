@@ -158,11 +158,8 @@ class Batch:
 
     CasADi reads from and writes to arrays that stay in place, which is several times as fast as
     passing matrices in and out. Up to 5 points are calls of their own: one for 20 costs as much as
-    half a dozen. More than 64 in a call need more memory at no gain.
-
-    Parameters
-    ----------
-    function  inputs are column vectors, outputs dense; it is kept
+    half a dozen. More than 64 in a call need more memory at no gain. Inputs of the `function`,
+    which is kept, are column vectors, outputs are dense.
     """
 
     sizes = (1, 20, 64)  # points of a call
@@ -188,14 +185,7 @@ class Batch:
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate at n points.
 
-        Parameters
-        ----------
-        *arguments : (n, rows)  one per input
-
-        Returns
-        -------
-        list of ndarray, shape (n, rows, columns)
-            One per output.
+        Each input has `arguments` of shape (n, rows), each output is (n, rows, columns).
         """
         count = len(arguments[0])
         outputs = [np.empty((count, *result.shape[1:])) for result in self._results]
@@ -215,14 +205,7 @@ class Batch:
     def at(self, *point: Array) -> list[Array]:
         """Evaluate at one point, with the least to do besides.
 
-        Parameters
-        ----------
-        *point : (rows,)  one per input
-
-        Returns
-        -------
-        list of ndarray, shape (columns, rows)
-            One per output.
+        Each input has a `point` of shape (rows,), each output is (columns, rows).
         """
         for store, argument in zip(self._arguments, point, strict=True):
             store[0] = argument

@@ -22,45 +22,27 @@ from pydrake.systems.primitives import TrajectorySource
 from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
-from ..results.torque import TorqueProfile
 from ..scene.model import Scene
-from .stretch import (
-    LINKS,
-    OBJECT,
-    PALM,
-    EngineDrive,
-    EngineRun,
-    EngineStretch,
-    Setting,
-    Shape,
-    Steps,
-    find_pairs,
-    find_rounding,
-    list_pairs,
-    list_shapes,
-    list_steps,
-    press_in,
-    record,
-)
+from . import interface as engine
 
-_EVERY = 4  # Steps from one look at the forces to the next: contacts swing ten times as slowly
+_EVERY = 4  # steps from one look at the forces to the next: contacts swing ten times as slowly
 
 
 def play(
-    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
-) -> EngineRun:
+    problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
+) -> engine.EngineRun:
     """Replay a stretch in Drake; an `Engine`."""
-    steps, drive = list_steps(problem, stretch, torque, setting.step), None
+    steps, drive = engine.list_steps(problem, stretch, torque, setting.step), None
     if isinstance(torque, ClosedLoop):
-        drive = EngineDrive(problem.scene, torque, _EVERY * steps.h)
+        drive = engine.EngineDrive(problem.scene, torque, _EVERY * steps.h)
     setting = setting._replace(step=steps.h / problem.scene.scales.time)
     with _quiet():
         diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
         simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
-    shares = {name: len(find_pairs(name, corners)) * stiffness for name in stretch.c_n}
-    plant.SetPositions(context, press_in(problem, stretch, shares))
+    shares = {name: len(engine.find_pairs(name, corners)) * stiffness for name in stretch.c_n}
+    plant.SetPositions(context, engine.press_in(problem, stretch, shares))
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
@@ -88,7 +70,7 @@ def play(
     def read() -> tuple[Array, Array]:
         return plant.GetPositions(context), plant.GetVelocities(context)
 
-    return record(stretch, steps, list_pairs(problem.scene), drive, advance, read)
+    return engine.record(stretch, steps, engine.list_pairs(problem.scene), drive, advance, read)
 
 
 @contextmanager
@@ -104,7 +86,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _build(
-    scene: Scene, steps: Steps, setting: Setting, plays: bool
+    scene: Scene, steps: engine.Steps, setting: engine.Setting, plays: bool
 ) -> tuple[Any, Any, dict[Any, int]]:
     """Diagram, plant, and the numbers of pairs by the identities of their shapes.
 
@@ -139,9 +121,9 @@ def _add_bodies(plant: Any, scene: Scene) -> None:
 
     polygon = scene.polygon
     assert polygon.inertia is not None
-    body = add(OBJECT, polygon.mass, polygon.inertia)
-    plant.AddJoint(tree.PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
-    for name, link in zip(LINKS, scene.fingers, strict=True):
+    body = add(engine.OBJECT, polygon.mass, polygon.inertia)
+    plant.AddJoint(tree.PlanarJoint(engine.OBJECT, plant.world_frame(), body.body_frame()))
+    for name, link in zip(engine.LINKS, scene.fingers, strict=True):
         link_body = add(name, link.inertia / link.length**2, link.inertia)
         place = RigidTransform([*np.asarray(link.base), 0.0])
         base = plant.AddFrame(tree.FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
@@ -151,16 +133,16 @@ def _add_bodies(plant: Any, scene: Scene) -> None:
     plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
 
 
-def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[Any, int]:
+def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -> dict[Any, int]:
     """Add balls, capsules and the palm; only pairs that may touch are looked at."""
-    shapes = {shape.name: shape for shape in list_shapes(scene)}
+    shapes = {shape.name: shape for shape in engine.list_shapes(scene)}
     geometry_ids: dict[tuple[str, float], Any] = {}
 
     def register(name: str, friction: float) -> Any:
         key = (name, friction)
         if key not in geometry_ids:
-            if name == PALM:
-                low = [0.0, -find_rounding(scene), 0.0]
+            if name == engine.PALM:
+                low = [0.0, -engine.find_rounding(scene), 0.0]
                 place = RigidTransform(RotationMatrix.MakeXRotation(-np.pi / 2), low)
                 body, form = plant.world_body(), geometry.HalfSpace()
             else:
@@ -172,7 +154,7 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
         return geometry_ids[key]
 
     numbers = {}
-    for number, pair in enumerate(list_pairs(scene)):
+    for number, pair in enumerate(engine.list_pairs(scene)):
         # Drake combines two frictions as 2 a b / (a + b), which is 2 b for a large a.
         one, two = (1e12, pair.friction / 2) if pair.friction else (0.0, 0.0)
         ids = [register(pair.first, one), register(pair.second, two)]
@@ -187,12 +169,12 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
     return numbers
 
 
-def _find_stiffness(scene: Scene, setting: Setting) -> float:
+def _find_stiffness(scene: Scene, setting: engine.Setting) -> float:
     """That of a pair, which sinks in by 6e-3 lengths under the scene's force [N/m]."""
     return scene.scales.force / (6e-3 * setting.step * setting.softness * scene.scales.length)
 
 
-def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
+def _make_material(scene: Scene, setting: engine.Setting, friction: float) -> Any:
     """Twice the stiffness of a pair, for both of its shapes."""
     material = geometry.ProximityProperties()
     geometry.AddContactMaterial(
@@ -204,7 +186,7 @@ def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
     return material
 
 
-def _place(shape: Shape) -> tuple[Any, Any]:
+def _place(shape: engine.Shape) -> tuple[Any, Any]:
     """A ball or a capsule, and where it is on its body."""
     middle = [*shape.points.mean(axis=0), 0.0]
     if len(shape.points) == 1:

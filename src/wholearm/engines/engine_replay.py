@@ -24,7 +24,7 @@ from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Samples, Trajectory
-from .stretch import (
+from .interface import (
     Engine,
     EngineRun,
     EngineStretch,
@@ -267,9 +267,7 @@ def compare(
 ) -> Departure:
     """Compare a replay with the plan.
 
-    Parameters
-    ----------
-    allowed  largest error of the position over the scene's length, and of the angle in rad
+    `allowed` is the largest error of the position over the scene's length, and of the angle in rad.
     """
     length = problem.scene.scales.length
     parts = _divide(problem, plan, stretch, run)

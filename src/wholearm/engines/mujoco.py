@@ -17,26 +17,10 @@ from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
-from ..results.torque import TorqueProfile, place_rows
+from ..results.torque import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .stretch import (
-    LINKS,
-    OBJECT,
-    PALM,
-    EngineDrive,
-    EngineRun,
-    EngineStretch,
-    Setting,
-    apply_friction,
-    find_pairs,
-    find_rounding,
-    list_pairs,
-    list_shapes,
-    list_steps,
-    press_in,
-    record,
-)
+from . import interface as engine
 
 SHARE = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
@@ -80,12 +64,14 @@ def write_mjcf(
     _add_options(root, scene, step)
     world = add(root, "worldbody")
     reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
-    place, size = [0.0, -find_rounding(scene), 0.0], [reach, reach, reach / 100]
-    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
+    place, size = [0.0, -engine.find_rounding(scene), 0.0], [reach, reach, reach / 100]
+    _add_geom(
+        world, engine.PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3"
+    )
     _add_object(world, scene, home[:3])
     _add_links(world, scene, home[3:])
     contact = add(root, "contact")
-    for pair in list_pairs(scene):
+    for pair in engine.list_pairs(scene):
         rough = pair.friction > 0
         add(
             contact,
@@ -128,7 +114,7 @@ def _add_options(root: Element, scene: Scene, step: float) -> None:
     add(visual, "global", azimuth="90", elevation="-89.9")
     add(visual, "headlight", ambient=".5 .5 .5", diffuse=".4 .4 .4")
     points = [(*corner, side) for side in (-depth, depth) for corner in scene.polygon.vertices]
-    add(add(root, "asset"), "mesh", name=OBJECT, inertia="convex", vertex=points)
+    add(add(root, "asset"), "mesh", name=engine.OBJECT, inertia="convex", vertex=points)
 
 
 def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None:
@@ -138,12 +124,12 @@ def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None
 
 def _add_object(world: Element, scene: Scene, q: Array) -> None:
     polygon = scene.polygon
-    body = add(world, "body", name=OBJECT, pos=[*q[:2], 0.0])
+    body = add(world, "body", name=engine.OBJECT, pos=[*q[:2], 0.0])
     add(body, "inertial", pos=[0, 0, 0], mass=polygon.mass, diaginertia=[polygon.inertia] * 3)
     for axis, (name, kind) in enumerate((("x", "slide"), ("y", "slide"), ("phi", "hinge"))):
         add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=q[axis])
     turned = [0.0, 0.0, q[2]]
-    _add_geom(body, OBJECT, "mesh", mesh=OBJECT, euler=turned, rgba=".9 .7 .3 1")
+    _add_geom(body, engine.OBJECT, "mesh", mesh=engine.OBJECT, euler=turned, rgba=".9 .7 .3 1")
     _add_shapes(body, scene, q[2])
 
 
@@ -151,7 +137,7 @@ def _add_links(world: Element, scene: Scene, theta: Array) -> None:
     for k, link in enumerate(scene.fingers):
         place = [*np.asarray(link.base), 0.0]
         # The weight of links is no part of the model.
-        body = add(world, "body", name=LINKS[k], pos=place, gravcomp="1")
+        body = add(world, "body", name=engine.LINKS[k], pos=place, gravcomp="1")
         # A uniform rod. MuJoCo makes the stiffness of a contact of how bodies move at their centres
         # of mass: at the joint that is not at all, and contacts of light links are too stiff.
         middle = link.length / 2 * np.array([np.cos(theta[k]), np.sin(theta[k]), 0.0])
@@ -165,7 +151,7 @@ def _add_links(world: Element, scene: Scene, theta: Array) -> None:
 def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
     """Balls and capsules, turned so that they are in place at the model's own position."""
     c, s = np.cos(angle), np.sin(angle)
-    for shape in list_shapes(scene):
+    for shape in engine.list_shapes(scene):
         if shape.body == body.get("name"):
             ends = np.pad(shape.points @ np.array([[c, s], [-s, c]]), ((0, 0), (0, 1)))
             kind, key = ("sphere", "pos") if len(ends) == 1 else ("capsule", "fromto")
@@ -178,7 +164,8 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
     At the start of a time step the lines between rows of torque are at the average over that step,
     so that torques that jump within one have the right effect.
     """
-    parts, rows = {part.tag: part for part in root}, place_rows(apply_friction(scene, plan), BEND)
+    parts = {part.tag: part for part in root}
+    rows = place_rows(engine.apply_friction(scene, plan), BEND)
     t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
     t[again] -= step / 2
     t[again + 1] += step / 2
@@ -225,20 +212,22 @@ def add(parent: Element, tag: str, **attributes: object) -> Element:
 
 
 def play(
-    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
-) -> EngineRun:
+    problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
+) -> engine.EngineRun:
     """Replay a stretch in MuJoCo; an `Engine`.
 
     ImportError if MuJoCo is not installed.
     """
     import mujoco
 
-    steps = list_steps(problem, stretch, torque, setting.step)
-    drive = EngineDrive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
+    steps = engine.list_steps(problem, stretch, torque, setting.step)
+    drive = None
+    if isinstance(torque, ClosedLoop):
+        drive = engine.EngineDrive(problem.scene, torque, steps.h)
     text = write_mjcf(problem, step=steps.h, softness=setting.softness)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    pairs = list_pairs(problem.scene)
+    pairs = engine.list_pairs(problem.scene)
     # Numbers of the pairs by the numbers of their shapes, in either order.
     numbers = np.full((model.ngeom, model.ngeom), -1)
     for number, pair in enumerate(pairs):
@@ -267,21 +256,23 @@ def play(
     nowhere = dict.fromkeys(stretch.c_n, np.inf)
     little = 1e-6 * problem.scene.scales.length
     touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
-    data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
+    data.qpos[:] = engine.press_in(problem, stretch, {**nowhere, **touching})
     mujoco.mj_forward(model, data)
     stiffnesses = np.zeros(len(pairs))
     collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
     names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
     shares = {
-        name: sum(stiffnesses[names.index(pair_name)] for pair_name in find_pairs(name, corners))
+        name: sum(
+            stiffnesses[names.index(pair_name)] for pair_name in engine.find_pairs(name, corners)
+        )
         or np.inf
         for name in stretch.c_n
     }
     mujoco.mj_resetData(model, data)
-    data.qpos[:], data.qvel[:] = press_in(problem, stretch, shares), steps.v
+    data.qpos[:], data.qvel[:] = engine.press_in(problem, stretch, shares), steps.v
     # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
     mujoco.set_mju_user_warning(lambda _: None)
-    run = record(
+    run = engine.record(
         stretch, steps, pairs, drive, advance, lambda: (data.qpos.copy(), data.qvel.copy())
     )
     mujoco.set_mju_user_warning(None)

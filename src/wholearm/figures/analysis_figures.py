@@ -143,10 +143,8 @@ def _name_failure(own: Survival) -> str:
 def draw_robustness(study: Robustness) -> Figure:
     """Draw paths and ends of the samples beside the nominal motion.
 
-    Returns
-    -------
-    Figure  axes in the order: hand and paths of the centroid, to scale; distances and angles from
-            the goal
+    Axes are in the order: hand and paths of the centroid, to scale; distances and angles from the
+    goal.
     """
     with style.open_figure(10.0, 4.6, layout="constrained") as figure:
         motion, ends = figure.subplots(1, 2, width_ratios=(1.5, 1.0))

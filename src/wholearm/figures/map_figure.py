@@ -51,14 +51,8 @@ _ARROW = np.array(
 def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Figure:
     """Draw a contact-formation map.
 
-    Parameters
-    ----------
-    plan  its path is drawn over the map, phase by phase; by default that of the problem's own
-          phases, as far as geometry alone gives it
-
-    Returns
-    -------
-    Figure  with one axes: x [mm] and phi [deg]
+    The path of `plan` is drawn over the map, phase by phase; by default that of the problem's own
+    phases, as far as geometry alone gives it. The figure has one axes: x [mm] and phi [deg].
     """
     problem = chart.problem
     paths = trace_problem(problem) if plan is None else []

@@ -226,9 +226,6 @@ def draw_phases(
         style.write(axes, text, place, (0, 4 + 10 * row), xycoords=units)
 
 
-if TYPE_CHECKING:
-    from ..simulation.events import Simulation
-
 _FORMATS: dict[str, dict[str, Any]] = {
     ".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None},
 }  # fmt: skip
@@ -252,10 +249,8 @@ def force_margins(
     width : [in]  of the figure, 3 to 40. Below 7 legends stand at the foot.
     motion        whether to draw the object's pose, and the joints' angles and speeds, too
 
-    Returns
-    -------
-    Figure  axes in the order: snapshots from left to right, margins, torques, the friction cones if
-            a contact rolls, and pose, angles and speeds
+    Axes are in the order: snapshots from left to right, margins, torques, the friction cones if a
+    contact rolls, and pose, angles and speeds.
 
     InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
     range.

@@ -108,18 +108,9 @@ def choose_numbers(
     """Choose which vertices of a polygon are numbered, and where the numbers stand.
 
     All of them where there is room, or every second, fifth, tenth, ... one, and those of `first`
-    before others. A number stands inside, or outside of an object with up to 5
-    vertices, which may be thin.
-
-    Parameters
-    ----------
-    vertices : (n, 2) [points]
-    lowest                      least height of the middle of a number [points]
-
-    Returns
-    -------
-    dict of ndarray, shape (2,), [points]
-        By vertex, where the middle of its number is, from it. Turns with the object.
+    before others. A number stands inside, or outside of an object with up to 5 vertices, which may
+    be thin, and its middle at `lowest` or above. Vertices, (n, 2), and heights are in points.
+    Returned is where the middle of each number is, from its vertex, (2,); it turns with the object.
     """
     count = len(vertices)
     along = np.roll(vertices, -1, axis=0) - vertices

@@ -77,10 +77,8 @@ def require_same_phases(problem: Problem, plan: Trajectory) -> None:
 def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
     """Write a motion to a ``.npz`` file, torques as CSV or a problem as TOML, by the ending.
 
-    Parameters
-    ----------
-    path  a ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as
-          dense as the torques are bent
+    A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as dense
+    as the torques are bent.
 
     InputError if the file has another ending or cannot be written, or torques alone are to be a
     motion.
@@ -117,14 +115,8 @@ def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
 def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan") -> str:
     """What differs from the problem that a plan or a policy was made for, in one line.
 
-    Parameters
-    ----------
-    problem  what it is used for
-    meta     with the tables of its own `problem`. Without them there is nothing to say.
-
-    Returns
-    -------
-    str  empty if nothing does
+    It is used for `problem`; its `meta` has the tables of its own. The line is empty without these,
+    and if nothing differs.
 
     InputError if it makes no sense for the problem: the object has other vertices, by number, or
     the hand is another one, a base or a length being off by more than a tenth of the link.

@@ -191,10 +191,7 @@ def find_uniqueness_margin(
     """The least uniqueness margin in a phase; None if nothing moved.
 
     Tangential forces tell which way a contact slides; one that leans on no side of its cone sticks.
-
-    Parameters
-    ----------
-    rows  its rows in the phase
+    `rows` are its rows in the phase.
     """
     formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
     columns = [motion.contacts.index(name) for name in formation.names]

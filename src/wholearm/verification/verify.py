@@ -20,25 +20,9 @@ from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_
 from ..mechanics.statics import Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem, Until
+from ..results import report as results
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
-from ..results.report import (
-    Approach,
-    ContactMargin,
-    EnergyBalance,
-    Failure,
-    FingerGap,
-    ForceAt,
-    LeastImpulse,
-    Loss,
-    ModeChange,
-    PhaseReport,
-    ReducedState,
-    Report,
-    SlipMargin,
-    TorqueAdvice,
-    TuningHelp,
-)
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
@@ -54,18 +38,7 @@ from ..simulation.modes import (
 )
 from ..simulation.simulate import simulate
 from ..simulation.system import SETTLING
-from .verdict import (
-    DEPARTURE,
-    REST_SPEED,
-    Allowance,
-    describe_departures,
-    describe_failures,
-    describe_thin_margins,
-    find_uniqueness_margin,
-    find_wedged,
-    judge_end,
-    measure_speed,
-)
+from . import verdict
 
 if TYPE_CHECKING:
     from .free import FreeReport
@@ -83,8 +56,8 @@ class Observation(NamedTuple):
     plan: Trajectory | None  # what it is compared with
     tolerance: float  # of the simulation
     simulation: Simulation
-    phases: tuple[PhaseReport, ...]
-    gap: FingerGap | None
+    phases: tuple[results.PhaseReport, ...]
+    gap: results.FingerGap | None
 
 
 @overload
@@ -94,11 +67,11 @@ def verify(
     *,
     contacts: Literal["prescribed"] = "prescribed",
     tolerance: float = 1e-9,
-    departure: float = DEPARTURE,
-    rest_speed: float = REST_SPEED,
+    departure: float = verdict.DEPARTURE,
+    rest_speed: float = verdict.REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
-) -> Report: ...
+) -> results.Report: ...
 @overload
 def verify(
     problem: Problem, what: Torques, *, contacts: Literal["free"], **options: Any
@@ -110,12 +83,12 @@ def verify(
     *,
     contacts: str = "prescribed",
     tolerance: float = 1e-9,
-    departure: float = DEPARTURE,
-    rest_speed: float = REST_SPEED,
+    departure: float = verdict.DEPARTURE,
+    rest_speed: float = verdict.REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
     **options: Any,
-) -> Report | FreeReport:
+) -> results.Report | FreeReport:
     """Simulate the torques of a plan, or given ones, open loop and report what happens.
 
     Every contact has to hold, every phase with an end at rest has to be at rest there, and the goal
@@ -150,7 +123,7 @@ def verify(
             "", "contacts", f"{', '.join(options)} needs free ones" if options else text
         )
     problem, torque, plan = adopt_torques(problem, what)
-    allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
+    allowance = verdict.Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)
     seen = observe(problem, torque, plan, tolerance, True)
     report = judge(seen, allowance, reduced)
@@ -191,7 +164,7 @@ def observe(
     return Observation(plan, tolerance, simulation, phases, gap)
 
 
-def find_finger_gap(simulation: Simulation) -> FingerGap:
+def find_finger_gap(simulation: Simulation) -> results.FingerGap:
     """Least gap of the fingers, on quintics through the recorded states."""
     t, z, scene = simulation.t, simulation.z, simulation.problem.scene
     left = np.repeat(np.flatnonzero(np.diff(t) > 0), 7)
@@ -201,17 +174,19 @@ def find_finger_gap(simulation: Simulation) -> FingerGap:
     times = np.append(t, t[left] + run)
     order = np.argsort(times, kind="stable")
     gaps = evaluate_finger_gap(scene, np.concatenate([z, inside]))
-    return FingerGap(*find_lowest(times[order], gaps[order], 2 * SETTLING * scene.scales.time))
+    return results.FingerGap(
+        *find_lowest(times[order], gaps[order], 2 * SETTLING * scene.scales.time)
+    )
 
 
-def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Report:
+def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False) -> results.Report:
     """Apply tolerances to a replay; see `verify`."""
     simulation, phases, gap = seen.simulation, seen.phases, seen.gap
     problem, torque = simulation.problem, simulation.torque
-    reached, outcome = judge_end(simulation, allowance)
-    failures = [] if reached else [Failure(len(phases), outcome)]
-    failures += describe_failures(simulation, phases, gap if reached else None, allowance)
-    thin = list(describe_thin_margins(simulation, phases, allowance))
+    reached, outcome = verdict.judge_end(simulation, allowance)
+    failures = [] if reached else [results.Failure(len(phases), outcome)]
+    failures += verdict.describe_failures(simulation, phases, gap if reached else None, allowance)
+    thin = list(verdict.describe_thin_margins(simulation, phases, allowance))
     warnings = _describe_torques(problem, torque)
     warnings += [
         f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
@@ -226,13 +201,13 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         if seen.plan is None:
             warnings.append(text)
         else:
-            failures.append(Failure(max(number, 1), text))
+            failures.append(results.Failure(max(number, 1), text))
     if seen.plan is not None:
         # The departure of later phases follows from that of the first.
-        failures += thin + list(describe_departures(problem, phases, allowance))[:1]
+        failures += thin + list(verdict.describe_departures(problem, phases, allowance))[:1]
     else:
         warnings += [failure.text for failure in thin]
-    return Report(
+    return results.Report(
         name=problem.name,
         epsilon=problem.epsilon,
         outcome=outcome,
@@ -247,7 +222,7 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         tolerance=seen.tolerance,
         steps=simulation.steps,
         changes=tuple(
-            ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
+            results.ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
             for e in simulation.events
             if e.kind in _CHANGES and e.contact
         ),
@@ -258,7 +233,7 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
 
 def _report_phase(
     simulation: Simulation, plan: Trajectory | None, index: int, uniqueness: bool
-) -> PhaseReport:
+) -> results.PhaseReport:
     problem, phase = simulation.problem, simulation.problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
     ends = EventKind.ARRIVAL, EventKind.RELEASE
@@ -282,23 +257,29 @@ def _report_phase(
         starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
         breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
         since = max(breaks, default=-math.inf)
-        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, since)
+        held = verdict.find_wedged(problem, phase, simulation, rows, verdict.REST_SPEED, since)
     if plan is not None:
         end, worst = _compare(simulation, plan, phase, bool(arrivals))
-    return PhaseReport(
+    return results.PhaseReport(
         number=phase.number,
         until=until,
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
-        contacts=tuple(ContactMargin(*least, least[1] - problem.epsilon) for least in pressing),
-        rolling=tuple(SlipMargin(*least) for least in slips),
+        contacts=tuple(
+            results.ContactMargin(*least, least[1] - problem.epsilon) for least in pressing
+        ),
+        rolling=tuple(results.SlipMargin(*least) for least in slips),
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
-        end_speed=measure_speed(problem.scene, simulation.z_dot[rows[-1]]) if stops else None,
-        impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
+        end_speed=verdict.measure_speed(problem.scene, simulation.z_dot[rows[-1]])
+        if stops
+        else None,
+        impact=results.LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
-        uniqueness_margin=find_uniqueness_margin(phase, simulation, rows) if uniqueness else None,
+        uniqueness_margin=verdict.find_uniqueness_margin(phase, simulation, rows)
+        if uniqueness
+        else None,
         wedged=held,
     )
 
@@ -347,7 +328,7 @@ def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
     return texts
 
 
-def _balance(simulation: Simulation) -> EnergyBalance:
+def _balance(simulation: Simulation) -> results.EnergyBalance:
     scene, energies = simulation.problem.scene, simulation.energies
     ends = simulation.z_dot[[0, -1]]
     kinetic = float(np.diff(0.5 * ends**2 @ scene.mass_diagonal)[0])
@@ -358,7 +339,7 @@ def _balance(simulation: Simulation) -> EnergyBalance:
     losses = viscous, dry, contact, impact
     scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses))
     relative = abs(residual) / scale if scale > 0 else 0.0
-    return EnergyBalance(work, kinetic, potential, *losses, residual, relative)
+    return results.EnergyBalance(work, kinetic, potential, *losses, residual, relative)
 
 
 def list_normal_forces(simulation: Simulation, phase: Phase) -> dict[str, Array]:
@@ -496,7 +477,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
 _OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
-def list_reduced_states(simulation: Simulation) -> tuple[ReducedState, ...]:
+def list_reduced_states(simulation: Simulation) -> tuple[results.ReducedState, ...]:
     """The scalar equation at a few instants of every phase with four constraints.
 
     At each instant theta_1 turns and every contact that the formation lets slide does so.
@@ -518,7 +499,7 @@ def list_reduced_states(simulation: Simulation) -> tuple[ReducedState, ...]:
             directions = Directions(np.sign(slip[k]), np.sign(v[k, 3:]))
             Phi = reduce_to_first_joint(formation, z[k], v[k, 3], tau[k], directions)
             time, joint = float(simulation.t[rows[k]]), (float(v[k, 3]), float(a[k, 3]))
-            states.append(ReducedState(time, index + 1, *Phi, *joint))
+            states.append(results.ReducedState(time, index + 1, *Phi, *joint))
     return tuple(states)
 
 
@@ -572,8 +553,8 @@ _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
 
 
 def find_help(
-    simulation: Simulation, phases: tuple[PhaseReport, ...], allowance: Allowance
-) -> TuningHelp:
+    simulation: Simulation, phases: tuple[results.PhaseReport, ...], allowance: verdict.Allowance
+) -> results.TuningHelp:
     """Losses with changes of the torques that prevent them, and the approach to a missed end."""
     problem = simulation.problem
     rolling = [{contact.name for contact in phase.formation.rolling} for phase in problem.phases]
@@ -592,12 +573,12 @@ def find_help(
     ]
     losses = (_examine_loss(simulation, *event) for event in events)
     approach = None if simulation.outcome.reached else find_approach(simulation)
-    return TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
+    return results.TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
 
 
 def _examine_loss(
     simulation: Simulation, index: int, contact: str, kind: str, time: float
-) -> Loss | None:
+) -> results.Loss | None:
     """A loss with changes that prevent it; None if the phase does not have the contact."""
     problem, phase = simulation.problem, simulation.problem.phases[index]
     formation, rows = phase.formation, np.flatnonzero(simulation.phase == index)
@@ -624,23 +605,25 @@ def _examine_loss(
     else:
         response = find_moving(formation, z, v, tau, simulation.z_ddot[row])
         changes = () if response is None else list_changes(response, v, epsilon, contact, tau)
-    forces: tuple[ForceAt, ...] = ()
+    forces: tuple[results.ForceAt, ...] = ()
     closing: tuple[float, ...] = ()
     if response is not None:
         forces = tuple(
-            ForceAt(name, float(c_n @ load), float(c_t @ load), (float(c_n[1]), float(c_n[2])))
+            results.ForceAt(
+                name, float(c_n @ load), float(c_t @ load), (float(c_n[1]), float(c_n[2]))
+            )
             for name, c_n, c_t in zip(formation.names, response.c, response.c_t, strict=False)
         )
     if response is not None and distance is not None:
         slope = -distance[1][0] @ response.acceleration
         closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
     when = float(simulation.t[row])
-    return Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
+    return results.Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
 
 def list_changes(
     response: Response, v: Array, epsilon: float, contact: str, tau: Array
-) -> tuple[TorqueAdvice, ...]:
+) -> tuple[results.TorqueAdvice, ...]:
     """Least changes of each torque alone that a moving contact is kept with, or of both.
 
     Both change if one alone misses other limits. What lets go with the contact is kept, too; what
@@ -657,7 +640,7 @@ def list_changes(
     slack, slope = normalise(find_sides(limits, response, v), scale, tau, unit)
     slack = np.where(missed, slack, np.maximum(slack, 0.0))
 
-    def describe(change: Array) -> TorqueAdvice:
+    def describe(change: Array) -> results.TorqueAdvice:
         short = -(slack + slope @ change)
         worst, but = int(short.argmax()), ""
         if short[worst] > KEPT:
@@ -676,7 +659,7 @@ def list_changes(
     return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
-def find_approach(simulation: Simulation) -> Approach | None:
+def find_approach(simulation: Simulation) -> results.Approach | None:
     """How near the last phase entered has come to its end; None if it ends by a release."""
     problem = simulation.problem
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
@@ -693,7 +676,7 @@ def find_approach(simulation: Simulation) -> Approach | None:
     unit = scales.rate if is_angle else scales.speed
     going = np.flatnonzero(np.abs(rates) > 1e-6 * unit)
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
-    return Approach(
+    return results.Approach(
         phase=phase.number,
         until=str(phase.until),
         distance=max(least, 0.0),
@@ -732,7 +715,7 @@ def find_resting_changes(
     z: Array,
     tau: Array,
     gradient: Array | None,
-) -> tuple[TorqueAdvice, ...]:
+) -> tuple[results.TorqueAdvice, ...]:
     """Least changes of each torque alone, or else of both, that let it keep its contacts.
 
     With them it begins to move towards the end of its phase, or if that cannot be it rests.
@@ -754,7 +737,7 @@ def find_resting_changes(
         scale = [limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)]
         sides = np.vstack([find_sides(limits, path.response, np.zeros(5)), rows])
         starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
-    changes: list[TorqueAdvice] = []
+    changes: list[results.TorqueAdvice] = []
     for free in _TORQUES:
         if len(free) == 2 and changes:
             break
@@ -815,10 +798,12 @@ def normalise(sides: Array, scale: Array, tau: Array, unit: float) -> tuple[Arra
     return np.asarray(slack), sides[:, 1:] * (unit / scale)[:, None]
 
 
-def make_advice(change: Array, tau: Array, but: str = "", holds: bool = False) -> TorqueAdvice:
+def make_advice(
+    change: Array, tau: Array, but: str = "", holds: bool = False
+) -> results.TorqueAdvice:
     """A change of torques `tau`, shape (2,) [N m]."""
     (first, second), (one, other) = change.tolist(), (tau + change).tolist()
-    return TorqueAdvice((first, second), (one, other), but, holds)
+    return results.TorqueAdvice((first, second), (one, other), but, holds)
 
 
 def find_least_change(slack: Array, slope: Array, free: tuple[int, ...]) -> Array | None:

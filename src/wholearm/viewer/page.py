@@ -26,9 +26,7 @@ from ..scene.model import Scene
 def build_page(title: str, parts: Iterable[str]) -> str:
     """A page of HTML with the style and the scripts that its parts need.
 
-    Parameters
-    ----------
-    parts  as the other functions of this module make them
+    `parts` are made by the other functions of this module.
     """
     folder = resources.files(__package__)
     style, script = (folder.joinpath(f"viewer.{kind}").read_text("utf-8") for kind in ("css", "js"))

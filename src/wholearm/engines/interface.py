@@ -193,7 +193,8 @@ class EngineRun(NamedTuple):
         return rows[: int(np.argmax(np.append(forces.any(axis=1), True)))]
 
 
-Engine = Callable[[Problem, EngineStretch, TorqueProfile | ClosedLoop, Setting], EngineRun]
+Drive = TorqueProfile | ClosedLoop  # torques that are applied, or by feedback
+Engine = Callable[[Problem, EngineStretch, Drive, Setting], EngineRun]
 """Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
 
 
@@ -212,9 +213,7 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
     return stretches
 
 
-def list_steps(
-    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, step: float
-) -> Steps:
+def list_steps(problem: Problem, stretch: EngineStretch, torque: Drive, step: float) -> Steps:
     """Even steps that fit a stretch, none longer than `step` times the scene's time.
 
     Torques by feedback are zero here.
@@ -334,13 +333,7 @@ def _list_independent(rows: Array, kept: int) -> list[int]:
 class EngineDrive:
     """Torques of a policy in an engine, sampled, delayed, and less regularized dry friction.
 
-    Parameters
-    ----------
-    h : [s]  time between two calls
-
-    Attributes
-    ----------
-    over  whether the motion is over
+    Two calls are `h` [s] apart; `over` says whether the motion is over.
     """
 
     def __init__(self, scene: Scene, loop: ClosedLoop, h: float) -> None:
