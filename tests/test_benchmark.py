@@ -513,11 +513,12 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
     if not PLANNERS[method].is_installed:
         pytest.skip(f"{method}: pip install 'wholearm[bench]'")
     (study, *_) = PLANNERS[method].choices
-    found = run_planner(study, phase(4).name, method, TRIED[method], FILES)
+    instance = phase(4, study != NO_DRAG)
+    found = run_planner(instance, method, TRIED[method])
     error, end, violation = found.errors
     assert found.outcome == SOLVED and abs(error) < 2e-2
     assert end < 1e-2 and violation < 2.6e-2
-    least = find_least_time(phase(4, study != NO_DRAG))
+    least = find_least_time(instance)
     assert least == pytest.approx(LEAST[study], rel=1e-5)
 
 

@@ -361,16 +361,6 @@ class PhaseTuning:
         """Its numbers, such as 3 or 9-11."""
         return f"{self.number}" if self.number == self.last else f"{self.number}-{self.last}"
 
-    @property
-    def finger(self) -> str:
-        """The finger behind the motion, for people."""
-        return f"finger {self.acting}"
-
-    @property
-    def support(self) -> int | None:
-        """How many times the supporting torque is raised while braking; None if it is not."""
-        return self.supported or None
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tuning(Result):
@@ -427,9 +417,9 @@ class Tuning(Result):
     def document(self) -> Document:
         """The verdict with its reason, and a table of the phases."""
         columns = {
-            "title": "phase:d", "until": "until", "finger": "acts",
+            "title": "phase:d", "until": "until", "acting": "finger:d",
             "quasistatic": "from [N m]:.4f", "raised": "drive:+d", "braked": "brake:+d",
-            "support": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
+            "supported": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
             "least": "least c_n [N]:.4f", "weakest": "of", "simulations": "simulations:d",
         }  # fmt: skip
         tuned = Table.of((phase for phase in self.phases if phase.acting), columns)
@@ -886,15 +876,9 @@ class TuningRule:
 def list_starts(tau: Array, acting: int) -> list[Array]:
     """Torques to begin with, of quasistatic ones along the way, shape (n, 2) [N m].
 
-    Those at the start; then with the supporting one where it presses most, or between the two. The
-    right finger presses anticlockwise, the left one clockwise.
+    Those at the start; then with the supporting one where it presses most. The right finger presses
+    anticlockwise, the left one clockwise.
     """
-    start, other = float(tau[0, 1 - acting]), 1 - acting
-    hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
-    values = list(dict.fromkeys([start, hard]))
-    if start and hard / start > 1:
-        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / SETTINGS.support_step)
-        values += [start * FACTOR ** (SETTINGS.support_step * n) for n in range(1, count)]
-    torques = np.tile(tau[0], (len(values), 1))
-    torques[:, other] = values
-    return list(torques)
+    hard = tau[0].copy()
+    hard[1 - acting] = tau[:, 0].max() if acting else tau[:, 1].min()
+    return [tau[0]] if (hard == tau[0]).all() else [tau[0], hard]

@@ -35,7 +35,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..common.document import Table
+from ..common.document import Table, plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import trace_phases
 from ..planning.nlp import record_runs
@@ -109,24 +109,17 @@ def list_cases() -> list[Case]:
 
 
 def answer(case: Case, folder: Path) -> Row:
-    """What the package says to a case, or why it refuses; `folder` has the shipped problems."""
+    """What the package says to a case, or why it refuses; `folder` has the shipped problems.
+
+    Plain values as JSON has them, numbers with nine digits.
+    """
     family, *arguments = case
     try:
         row = FAMILIES[family][0](folder, *arguments)
     except wholearm.WholearmError as error:
         row = _refuse(error)
-    return dict(_shorten(row))
-
-
-def _shorten(value: Any) -> Any:
-    """Plain values for JSON: numbers with nine digits, None for NaN and infinity."""
-    if isinstance(value, dict):
-        return {key: _shorten(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_shorten(entry) for entry in value]
-    if isinstance(value, float):
-        return float(f"{value:.9g}") if math.isfinite(value) else None
-    return value
+    text = json.dumps(plain(row))
+    return dict(json.loads(text, parse_float=lambda digits: float(f"{float(digits):.9g}")))
 
 
 def _load(folder: Path, name: str) -> Problem:
@@ -141,13 +134,10 @@ def mask(text: str) -> str:
 def _refuse(error: Exception) -> Row:
     """Why there is no answer."""
     row: Row = {"refused": type(error).__name__, "words": mask(str(error)), "text": str(error)}
-    short = getattr(error, "shortfalls", ())
-    if short:
-        row["short"] = [short[0].part, short[0].kind, short[0].place.phase]
-        row["amount"] = short[0].amount
+    for short in getattr(error, "shortfalls", ())[:1]:
+        row |= {"short": [short.part, short.kind, short.place.phase], "amount": short.amount}
     changes = getattr(error, "changes", ())
-    row["advice"] = {change.parameter.key: change.value for change in changes}
-    return row
+    return row | {"advice": {change.parameter.key: change.value for change in changes}}
 
 
 def list_modes(plan: Plan) -> list[list[str]]:
@@ -172,10 +162,9 @@ def _describe_plan(plan: Plan) -> Row:
         "modes": list_modes(plan),
         "impacts": len(plan.transitions),
     }
-    if any(phase.settling for phase in plan.phases):
-        row["dwells"] = [
-            phase.settling.duration if phase.settling else 0.0 for phase in plan.phases
-        ]
+    dwells = [phase.settling.duration if phase.settling else 0.0 for phase in plan.phases]
+    if any(dwells):
+        row["dwells"] = dwells
     if plan.certificate is not None:
         row["gaps"] = sorted(plan.certificate.gaps)
         row["bound"] = None if plan.certificate.total is None else plan.certificate.total.bound
@@ -276,12 +265,12 @@ def _simulate_free(folder: Path, name: str) -> Row:
         "failures": [mask(text) for text in report.failures],
         "phases": [phase.number for phase in report.alone if phase.reached],
         "stops": [phase.stop for phase in report.alone],
-        "lost": [f"{number} {loss.contact}" for number, loss in _list_losses(report.alone)],
+        "lost": [f"{number} {contact}" for number, contact, _ in _list_losses(report.alone)],
     }
 
 
-def _list_losses(phases: Iterable[Any]) -> list[tuple[int, Any]]:
-    return [(phase.number, loss) for phase in phases for loss in phase.losses]
+def _list_losses(phases: Iterable[Any]) -> list[tuple[int, str, float]]:
+    return [(each.number, loss.contact, loss.time) for each in phases for loss in each.losses]
 
 
 def _follow(folder: Path, name: str, share: float) -> Row:
@@ -292,12 +281,12 @@ def _follow(folder: Path, name: str, share: float) -> Row:
     report = wholearm.verify_free(problem, torque)
     lost = _list_losses(report.phases)
     # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.
-    end = min([report.phases[0].stop, *(loss.time for _, loss in lost)]) - 1e-3
+    end = min([report.phases[0].stop, *(time for *_, time in lost)]) - 1e-3
     events = [event for event in report.whole.events if event.time < end]
     free = {
         "ok": report.ok,
-        "lost": [f"{number} {loss.contact}" for number, loss in lost[:1]],
-        "times": [loss.time for _, loss in lost[:1]],
+        "lost": [f"{number} {contact}" for number, contact, _ in lost[:1]],
+        "times": [time for *_, time in lost[:1]],
         "stops": [phase.stop for phase in report.phases if not lost or phase.number < lost[0][0]],
         "events": [event.time for event in events],
         "kinds": [f"{event.kind.value} {event.contact}" for event in events],
@@ -349,7 +338,7 @@ def _control(folder: Path, name: str) -> Row:
         "ok": report.ok,
         "reached": [phase.number for phase in report.phases if phase.reached],
         "stops": [phase.stop for phase in report.phases],
-        "lost": [f"{number} {loss.contact}" for number, loss in _list_losses(report.phases)],
+        "lost": [f"{number} {contact}" for number, contact, _ in _list_losses(report.phases)],
     }
 
 
@@ -372,20 +361,10 @@ def _compare(folder: Path, name: str) -> Row:
         path = str(Path(place, "plan.npz"))
         wholearm.solve(problem).save(path)
         comparison = wholearm.compare(problem, [path, str(folder / "torques" / TUNED[name][0])])
-    numbers = _collect(
-        comparison.contenders,
-        ok="ok",
-        durations="duration",
-        efforts="effort",
-        margins="margin",
-        losses="lost",
-        peaks="peaks",
-        simulations="simulations",
-    )
-    contacts = [
-        f"{contender.contact} in phase {contender.phase}" for contender in comparison.contenders
-    ]
-    return numbers | {"contacts": contacts}
+    names = {"ok": "ok", "durations": "duration", "efforts": "effort", "margins": "margin"}
+    names |= {"losses": "lost", "peaks": "peaks", "simulations": "simulations"}
+    contacts = [f"{each.contact} in phase {each.phase}" for each in comparison.contenders]
+    return _collect(comparison.contenders, **names) | {"contacts": contacts}
 
 
 def _collect(items: Iterable[Any], **names: str) -> Row:

@@ -109,11 +109,6 @@ def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance,
     return tuple(instances.values())
 
 
-def pick(name: str, paths: tuple[str, ...], drag: bool = True) -> Instance:
-    """The phase of a name, of problem files."""
-    return next(instance for instance in list_instances(paths, drag) if instance.name == name)
-
-
 class PeerPlan(NamedTuple):
     """What a planner has found for one phase."""
 
@@ -383,11 +378,9 @@ SIMULATORS = {
 }
 
 
-def run_simulator(
-    study: str, name: str, method: str, setting: str, files: tuple[str, ...]
-) -> Median | None:
+def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Median | None:
     """Run one setting of one simulator on one phase; None if the phase has no course."""
-    course = make_course(pick(name, files), study)
+    course = make_course(instance, study)
     if course is None:
         return None
 
@@ -465,9 +458,8 @@ def build_plant(formation: Formation) -> Expression:
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
 
 
-def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
+def run_planner(instance: Instance, method: str, setting: str) -> Median:
     """Run one setting of one planner on one phase, and check its plans."""
-    instance = pick(name, files, study != NO_DRAG)
     if module := PLANNERS[method].module:
         # No timing is to include the import.
         __import__(module)
@@ -886,8 +878,13 @@ class Precision(Study):
 
     def run(self, case: Case) -> Row:
         """Measure one setting."""
-        run = run_simulator if case[0] in SIMULATION else run_planner
-        median = run(*case)
+        study, name, method, setting, files = case
+        instances = list_instances(files, study != NO_DRAG)
+        instance = next(instance for instance in instances if instance.name == name)
+        if study in PLANNING:
+            median: Median | None = run_planner(instance, method, setting)
+        else:
+            median = run_simulator(instance, study, method, setting)
         row = dict(zip(self.columns[:4], case, strict=False))
         return row if median is None else row | median._asdict()
 
