@@ -45,8 +45,7 @@ _PARTS = ("palm", "finger1", "finger2", "viscous", "dry", "torque_limit")
 CHANGES = {"noise": (("mass", "inertia"), 1e-10), "change": (("mass", "inertia", *_PARTS), 0.1)}
 """Numbers that each of them changes, and by how much at most, relative."""
 
-Finding = tuple[str, str]
-"""The kind of something that must not happen, and a text."""
+Finding = tuple[str, str]  # the kind of something that must not happen, and a text
 KINDS = (
     "traceback", "warning", "list that does not load", "plan refuted by replay",
     "plan refuted by residual", "refusal where a motion exists", "no answer",

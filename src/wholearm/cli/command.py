@@ -18,8 +18,8 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from importlib import import_module, resources
 from pathlib import Path
@@ -293,8 +293,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         words = prepare(sys.argv[1:] if arguments is None else arguments)
         options = build_parser(words).parse_args(words)
-        with progress_log():
+        if not sys.stderr.isatty():
+            _LINES.begin(os.getpid())
+        try:
             status: int = options.run(options)
+        finally:
+            _LINES.begin(0)
         sys.stdout.flush()
         return status
     except WholearmError as error:
@@ -431,19 +435,8 @@ class _Lines:
 _LINES = _Lines()  # those of the command, which may show progress of several things
 
 
-@contextmanager
-def progress_log() -> Iterator[None]:
-    """Where stderr is no terminal, have a line logged every ten seconds of a command."""
-    if not sys.stderr.isatty():
-        _LINES.begin(os.getpid())
-    try:
-        yield
-    finally:
-        _LINES.begin(0)
-
-
 def show_progress() -> Callable[[str], None]:
-    """What shows progress."""
+    """What shows progress: a line that changes in a terminal, and else one every ten seconds."""
     if not sys.stderr.isatty():
         return _LINES.say
 

@@ -9,10 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-"""Floating-point numbers."""
-Expression = Any
-"""What CasADi computes with: SX, MX, DM or Function, for which it has no types."""
+Array = NDArray[np.float64]  # floating-point numbers
+Expression = Any  # what CasADi computes with: SX, MX, DM or Function, for which it has no types
 
 
 _Number = TypeVar("_Number", np.float64, np.int64)

@@ -21,8 +21,7 @@ from .errors import InputError, require_number, require_vector
 
 T = TypeVar("T")
 REQUIRED: Any = object()  # default of what has to be given
-Schema = Mapping[str, Any]
-"""JSON Schema of a value."""
+Schema = Mapping[str, Any]  # JSON Schema of a value
 
 
 @dataclass(frozen=True)

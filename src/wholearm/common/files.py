@@ -138,8 +138,7 @@ def _remove(part: str) -> None:
     _parts.discard(part)
 
 
-_parts: set[str] = set()
-"""Temporary files that exist now."""
+_parts: set[str] = set()  # temporary files that exist now
 
 
 _staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default=None)

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -36,9 +34,13 @@ def play(
     if isinstance(torque, ClosedLoop):
         drive = engine.EngineDrive(problem.scene, torque, _EVERY * steps.h)
     setting = setting._replace(step=steps.h / problem.scene.scales.time)
-    with _quiet():
-        diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
-        simulator = Simulator(diagram)
+    # Half spaces touch nothing deformable, which would be a warning.
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
+    simulator = Simulator(diagram)
+    log.setLevel(level)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
     shares = {name: len(engine.find_pairs(name, corners)) * stiffness for name in stretch.c_n}
@@ -71,18 +73,6 @@ def play(
         return plant.GetPositions(context), plant.GetVelocities(context)
 
     return engine.record(stretch, steps, engine.list_pairs(problem.scene), drive, advance, read)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hold back a warning that half spaces touch nothing deformable."""
-    log = logging.getLogger("drake")
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 def _build(
@@ -147,7 +137,14 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -
                 body, form = plant.world_body(), geometry.HalfSpace()
             else:
                 body, (place, form) = plant.GetBodyByName(shapes[name].body), _place(shapes[name])
-            material = _make_material(scene, setting, friction)
+            # Twice the stiffness of a pair, for both of its shapes.
+            material = geometry.ProximityProperties()
+            geometry.AddContactMaterial(
+                material,
+                dissipation=1000.0 / scene.scales.speed,
+                point_stiffness=2 * _find_stiffness(scene, setting),
+                friction=multibody.CoulombFriction(friction, friction),
+            )
             geometry_ids[key] = plant.RegisterCollisionGeometry(
                 body, place, form, f"{name} {friction:g}", material
             )
@@ -172,18 +169,6 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -
 def _find_stiffness(scene: Scene, setting: engine.Setting) -> float:
     """That of a pair, which sinks in by 6e-3 lengths under the scene's force [N/m]."""
     return scene.scales.force / (6e-3 * setting.step * setting.softness * scene.scales.length)
-
-
-def _make_material(scene: Scene, setting: engine.Setting, friction: float) -> Any:
-    """Twice the stiffness of a pair, for both of its shapes."""
-    material = geometry.ProximityProperties()
-    geometry.AddContactMaterial(
-        material,
-        dissipation=1000.0 / scene.scales.speed,
-        point_stiffness=2 * _find_stiffness(scene, setting),
-        friction=multibody.CoulombFriction(friction, friction),
-    )
-    return material
 
 
 def _place(shape: engine.Shape) -> tuple[Any, Any]:

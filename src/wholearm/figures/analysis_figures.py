@@ -19,7 +19,7 @@ from .snapshots import place_vertices, trace_link
 if TYPE_CHECKING:
     from ..analysis.comparison import Comparison
     from ..analysis.robustness import Robustness
-    from ..analysis.slow_speeds import PhasePrediction, Prediction, Survival
+    from ..analysis.slow_speeds import PhasePrediction, Prediction
 
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
@@ -113,7 +113,11 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
         axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
         if survival.speed:
             axes.plot(survival.speed, epsilon, "o", color=colour, markersize=5, zorder=6)
-        text = f"{survival.motion}, {_name_failure(survival)}"
+        again = "never" if survival.again is None else f"only from {survival.again:.3g} m/s on"
+        speed = f"{survival.speed:.3g} m/s" if survival.speed else again
+        failure = f"{speed}: {survival.first.name}"
+        failure = "keeps \u03b5 at any speed" if survival.speed is None else failure
+        text = f"{survival.motion}, {failure}"
         style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **above)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
@@ -128,15 +132,6 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(color=style.GRID, linewidth=0.4)
-
-
-def _name_failure(own: Survival) -> str:
-    """What gives way first in one motion, and at which speed."""
-    if own.speed is None:
-        return "keeps \u03b5 at any speed"
-    again = "never" if own.again is None else f"only from {own.again:.3g} m/s on"
-    speed = f"{own.speed:.3g} m/s" if own.speed else again
-    return f"{speed}: {own.first.name}"
 
 
 @exclusive

@@ -25,8 +25,7 @@ class Moved(Protocol):
         """The motion with its forces and torques."""
 
 
-Torques = TorqueProfile | Trajectory | Moved
-"""What torques can be taken of."""
+Torques = TorqueProfile | Trajectory | Moved  # what torques can be taken of
 
 
 def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
