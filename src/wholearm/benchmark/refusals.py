@@ -267,11 +267,7 @@ def fast_margin(
 
 
 def _solve_along(
-    scene: Scene,
-    phase: Phase,
-    epsilon: float,
-    curve: tuple[Array, Array, Array, Array],
-    top: Array,
+    scene: Scene, phase: Phase, epsilon: float, curve: tuple[Array, Array, Array, Array], top: Array
 ) -> float:
     """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
 
@@ -349,13 +345,7 @@ def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array
 
 
 def _limits(
-    scene: Scene,
-    phase: Phase,
-    epsilon: float,
-    z: Array,
-    z_s: Array,
-    z_ss: Array,
-    signs: Array,
+    scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array, z_ss: Array, signs: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Limits at n places, as rows over x = (a, b, v, c) >= least.
 

@@ -677,10 +677,7 @@ def plot(options: argparse.Namespace) -> int:
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
         figure = wholearm.plots.force_margins(
-            trajectory,
-            simulation=simulation,
-            motion=options.motion,
-            **list_given(options, "width"),
+            trajectory, simulation=simulation, motion=options.motion, **list_given(options, "width")
         )
     wholearm.plots.save(figure, options.output)
     return finish(options, None, options.output)

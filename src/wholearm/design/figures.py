@@ -159,11 +159,7 @@ def _draw_lines(
 
 
 def _draw_plane(
-    axes: Axes,
-    sweep: Sweep,
-    shown: Sequence[str],
-    rows: Sequence[Row],
-    colours: Mapping[str, str],
+    axes: Axes, sweep: Sweep, shown: Sequence[str], rows: Sequence[Row], colours: Mapping[str, str]
 ) -> Any:
     """Values over two parameters as cells, with contour lines, and regions without a plan."""
     axes.set(xlabel=sweep.titles[shown[0]], ylabel=sweep.titles[shown[1]])

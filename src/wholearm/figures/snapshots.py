@@ -217,12 +217,7 @@ def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool
 
 
 def draw_strip(
-    figure: Figure,
-    top: float,
-    strip: Strip,
-    trajectory: Trajectory,
-    scene: Scene,
-    styles: Styles,
+    figure: Figure, top: float, strip: Strip, trajectory: Trajectory, scene: Scene, styles: Styles
 ) -> None:
     """Draw the snapshots of a strip whose upper end is at `top` [in], with times and phases."""
     room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
