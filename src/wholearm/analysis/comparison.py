@@ -104,11 +104,7 @@ class Comparison(Result):
     @property
     def document(self) -> Document:
         """A table of all, one of their phases, and the reasons of those that fail."""
-        failed = [
-            f"{contender.name}: {contender.reason}"
-            for contender in self.contenders
-            if not contender.ok
-        ]
+        failed = [f"{each.name}: {each.reason}" for each in self.contenders if not each.ok]
         names = [contender.name for contender in self.contenders]
         heads = [f"{name}:{form}" for form in (".5f", "+z.4f") for name in names]
         lasts = zip_longest(*(contender.lasts for contender in self.contenders))
@@ -161,14 +157,9 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
         simulations = simulations if isinstance(simulations, int) else None
     peaks = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
-    common: dict[str, Any] = {
-        "name": name,
-        "effort": torque.integrate_squares(),
-        "peaks": (float(peaks[0]), float(peaks[1])),
-        "simulations": simulations,
-        "problem": problem,
-        "planned": planned,
-    }
+    common: dict[str, Any] = {"name": name, "problem": problem, "planned": planned}
+    common |= {"effort": torque.integrate_squares(), "peaks": tuple(peaks.tolist())}
+    common |= {"simulations": simulations}
     try:
         report = verify(problem, planned or torque)
     except (JammingError, SimulationError) as error:
@@ -179,19 +170,18 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         key=lambda pair: pair[0].least,
         default=(None, 0),
     )
-    energy, ends = report.energy, [phase.arrival for phase in report.phases]
-    starts = [phase.start for phase in report.phases]
+    energy, end = report.energy, report.phases[-1].arrival
     return Contender(
         ok=report.ok,
         reason=report.reason,
-        duration=ends[-1] if report.reached and ends[-1] is not None else torque.duration,
+        duration=end if report.reached and end is not None else torque.duration,
         margin=None if least is None else least.margin,
         contact="" if least is None else least.contact,
         phase=number,
         lost=energy.viscous + energy.dry + energy.contact + energy.impact,
         lasts=tuple(
-            math.nan if end is None else end - start
-            for end, start in zip(ends, starts, strict=True)
+            math.nan if phase.arrival is None else phase.arrival - phase.start
+            for phase in report.phases
         ),
         margins=tuple(math.nan if force is None else force.margin for force, _ in forces),
         report=report,

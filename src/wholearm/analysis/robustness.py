@@ -352,7 +352,7 @@ class Robustness(Result):
 
     @property
     def headline(self) -> str:
-        """What it is, in a line."""
+        """What it is, in a line, without the simulations that the document takes."""
         count = len(self.records)
         return f"{count} samples, goal reached {self.reached}, contacts kept {self.kept}"
 
@@ -397,11 +397,10 @@ class Robustness(Result):
             slope = "a contact is lost at once" if math.isnan(sensitivity.slope) else slope
             rows.append((sensitivity.name, width, slope, sensitivity.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
-        end, missed = self.nominal, ""
+        end = self.nominal
+        missed = "" if end["reached"] else str(end["ended"])
         if not end["reached"] and "distance" in end:
             missed = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
-        elif not end["reached"]:
-            missed = str(end["ended"])
         place_of = f" on {least.contact} at t = {least.time:.4g} s"
         return Document(
             f"{trial.problem.name}, {place}",

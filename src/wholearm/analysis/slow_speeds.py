@@ -140,9 +140,7 @@ def _predict_phase(
         path="line" if path.curve is None else "curve",
         length=path.length,
         slow=_name(path, motions["steady"][0](0.0)),
-        kept=tuple(
-            (_place(path, run.start), _place(path, run.stop - 1)) for run in find_runs(held)
-        ),
+        kept=tuple((_place(path, r.start), _place(path, r.stop - 1)) for r in find_runs(held)),
         survivals=tuple(survivals),
         torques=torques,
         curves=_draw(survivals, motions, unit),
@@ -177,16 +175,14 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
 
 
 def _name(path: PathSamples, least: Least) -> Weakest:
-    limits = [path.force_limits.limits.limits[k] for k in least.limits]
-    contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
-    kinds = dict.fromkeys(limit.kind for limit in limits if limit.kind not in (PRESS, CONE))
-    others = (
-        f"{kind} of "
-        f"{' and '.join(dict.fromkeys(limit.part for limit in limits if limit.kind == kind))}"
-        for kind in kinds
-    )
+    parts = dict[str, dict[str, None]]()  # contacts, and others by kind of limit
+    for limit in (path.force_limits.limits.limits[k] for k in least.limits):
+        kind = "" if limit.kind in (PRESS, CONE) else limit.kind
+        parts.setdefault(kind, {})[limit.part] = None
+    contacts = tuple(parts.pop("", {}))
+    others = tuple(f"{kind} of {' and '.join(each)}" for kind, each in parts.items())
     force = least.force if math.isfinite(least.force) else None
-    return Weakest(tuple(contacts), tuple(others), _place(path, least.place), force)
+    return Weakest(contacts, others, _place(path, least.place), force)
 
 
 def _place(path: PathSamples, row: int) -> Place:
