@@ -109,8 +109,8 @@ def test_solve_writes_samples_and_what_becomes_of_them(
 @pytest.mark.parametrize(
     "given, message",
     [
-        (["--sample-rate", "100"], "--sample-rate: needs --torques FILE"),
-        (["--torques", "a.csv", "--interpolation", "hold"], "--interpolation: is for tables"),
+        (["--sample-rate", "100"], "--sample-rate: needs --torques"),
+        (["--torques", "a.csv", "--interpolation", "hold"], "--interpolation: needs --sample-rate"),
         (["--torques", "a.csv", "--sample-rate", "-5"], "--sample-rate: -5.0 given; allowed"),
         (
             ["--torques", "a.csv", "--sample-rate", "9", "--interpolation", "cubic"],

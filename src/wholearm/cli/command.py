@@ -481,6 +481,14 @@ def finish(
     return 0 if result is None else result.exit_status
 
 
+def require_with(options: argparse.Namespace, needed: str, *names: str) -> None:
+    """Check that an option is given, or else none of those that need it."""
+    for name in names if getattr(options, needed) in (None, False) else ():
+        if getattr(options, name) not in (None, False):
+            flags = (f"--{each.replace('_', '-')}" for each in (name, needed))
+            raise InputError("", next(flags), f"needs {next(flags)}")
+
+
 def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Options that are given, of those with some names."""
     values = {name: getattr(options, name, None) for name in names}
@@ -596,13 +604,11 @@ def solve(options: argparse.Namespace) -> int:
 
 def _choose_table(options: argparse.Namespace) -> Callable[[wholearm.Plan], TorqueTable] | None:
     """What makes the torque table of a plan, checked before anything is planned; None for none."""
-    rate, interpolation = options.sample_rate, options.interpolation or "linear"
-    if rate is None and options.interpolation is not None:
-        raise InputError("", "--interpolation", "is for tables with a --sample-rate")
+    require_with(options, "sample_rate", "interpolation")
+    require_with(options, "torques", "sample_rate")
     if options.torques is None:
-        if rate is not None:
-            raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
         return None
+    rate, interpolation = options.sample_rate, options.interpolation or "linear"
     from ..planning import replay_check
     from ..results.torque import require_sampling
 
@@ -617,7 +623,11 @@ def verify(options: argparse.Namespace) -> int:
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
     values = list_given(options, *keys)
-    _check_free(options)
+    require_with(options, "free", "restitution", "policy")
+    require_with(options, "policy", "sensor")
+    for key, value in {"--reduced": options.reduced, "--rest-speed": options.rest_speed}.items():
+        if value and options.free:
+            raise InputError("", key, "does not go with --free")
     policy, notes = None, dict[str, list[str]]()
     torques: wholearm.Trajectory | wholearm.TorqueProfile
     if not _is_table(options.torques):
@@ -641,19 +651,6 @@ def verify(options: argparse.Namespace) -> int:
     if options.output is not None:
         report.trajectory.save(options.output)
     return finish(options, report, options.output, notes=notes)
-
-
-def _check_free(options: argparse.Namespace) -> None:
-    """Check that nothing is asked for that the other simulator does."""
-    others = {"--reduced": options.reduced, "--rest-speed": options.rest_speed}
-    for key, value in others.items() if options.free else ():
-        if value:
-            raise InputError("", key, "does not go with --free")
-    for key, value in {"--restitution": options.restitution, "--policy": options.policy}.items():
-        if value is not None and not options.free:
-            raise InputError("", key, "needs --free")
-    if options.sensor and options.policy is None:
-        raise InputError("", "--sensor", "needs --policy")
 
 
 def _is_table(path: str) -> bool:
@@ -702,8 +699,7 @@ def predict(options: argparse.Namespace) -> int:
 
     require_output(options.output)
     require_output(options.torques, ".csv")
-    if options.torques is None and options.speed is not None:
-        raise InputError("", "--speed", "is for --torques FILE, the torques to write")
+    require_with(options, "torques", "speed")
     problem = read_problem(options)
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress())
     save_figure(options.output, "figures.analysis_figures:draw_prediction", prediction)
@@ -746,8 +742,7 @@ def robustness(options: argparse.Namespace) -> int:
     output = options.output or f"{'_'.join(parts)}.jsonl"
     require_output(output, ".jsonl")
     require_output(options.figure)
-    if options.sensor and options.policy is None:
-        raise InputError("", "--sensor", "needs --policy")
+    require_with(options, "policy", "sensor")
     problem, plan, policy, notes = load_plan(options, options.plan, options.json)
     widths: dict[str, float] = {}
     for text in options.vary:
