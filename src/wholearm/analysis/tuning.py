@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -355,6 +355,8 @@ class PhaseTuning:
     weakest: str = ""
     trials: tuple[TuningTrial, ...] = ()
     simulations: int = 0
+    end: Array | None = field(default=None, repr=False)  # (5,): where it rests then, if it does
+    reason: str = field(default="", repr=False)  # why it does not
 
     @property
     def title(self) -> str:
@@ -468,38 +470,30 @@ def tune(
     with name_source(problem.source):
         for passage in split_passages(problem):
             setting = _Setting(problem, passage, brake, squeeze, share, tell)
-            parts, end, reason = _carry(setting, z, stops)
-            tuned += parts
-            if end is None:
-                title = parts[-1].title
-                reason = f"phase{'s' if '-' in title else ''} {title}: {reason}"
-                return Tuning(problem.name, tuple(tuned), None, None, reason)
+            tuned += (parts := _carry(setting, z, stops))
             for part in parts:
+                if part.end is None:
+                    reason = f"phase{'s' if '-' in part.title else ''} {part.title}: {part.reason}"
+                    return Tuning(problem.name, tuple(tuned), None, None, reason)
                 steps += [step._replace(time=clock + step.time) for step in part.steps]
                 clock += part.duration + setting.pause
-            z = end
+                z = part.end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
     return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
-def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], Array | None, str]:
+def _carry(setting: _Setting, z: Array, stops: int) -> list[PhaseTuning]:
     """Tune a passage from rest at `z`, with stops on the way where that does not succeed."""
-    tuning, end, reason = setting.tune(z)
-    halves = setting.halve(z) if end is None and stops else None
+    tuning = setting.tune(z)
+    halves = setting.halve(z) if tuning.end is None and stops else None
     if halves is None:
-        return [tuning], end, reason
-    first, z_middle, why = _carry(halves[0], z, (stops - 1) // 2)
-    spent = tuning.simulations
-    first[0] = replace(first[0], simulations=first[0].simulations + spent)
-    if z_middle is None:
-        return first, None, why
-    second, end, reason = _carry(halves[1], z_middle, stops - len(first))
-    return [*first, *second], end, reason
-
-
-_Attempt = tuple[PhaseTuning, Array | None, str]
-"""The tuned phase, its end at rest if it is reached, and else the reason."""
+        return [tuning]
+    first = _carry(halves[0], z, (stops - 1) // 2)
+    first[0] = replace(first[0], simulations=first[0].simulations + tuning.simulations)
+    if first[-1].end is None:
+        return first
+    return [*first, *_carry(halves[1], first[-1].end, stops - len(first))]
 
 
 class _Setting(NamedTuple):
@@ -539,16 +533,17 @@ class _Setting(NamedTuple):
         second = Passage(phases[k:], self.passage.after)
         return self._replace(passage=first), self._replace(passage=second)
 
-    def tune(self, z: Array) -> _Attempt:
-        """Tune it from rest at `z`; where it ends at rest, or why it does not."""
+    def tune(self, z: Array) -> PhaseTuning:
+        """Tune it from rest at `z`."""
         phases = self.passage.phases
         tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return tuning, None, "a coordinate is passed in motion; the rule tunes phases to rest"
+            text = "a coordinate is passed in motion; the rule tunes phases to rest"
+            return replace(tuning, reason=text)
         balance = self._balance(phases, z)
         if balance is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
-            return tuning, None, text
+            return replace(tuning, reason=text)
         best, (balanced, acting) = None, balance
         title = f"phase {tuning.title} of {len(self.problem.phases)}, finger {acting + 1}"
         bench = Bench(self.problem, self.passage, z, lambda text: self.tell(f"{title}: {text}"))
@@ -556,58 +551,53 @@ class _Setting(NamedTuple):
         for tau in list_starts(balanced, acting):
             rule = TuningRule(bench, tau, balanced[-1], acting)
             attempt = self._tune_from(rule, replace(tuning, acting=acting + 1))
-            if attempt[1] is not None:
+            if attempt.end is not None:
                 return attempt
-            if best is None or best[0].raised is None:
+            if best is None or best.raised is None:
                 best = attempt
             if rule.is_exhausted:
                 break
         assert best is not None
         return best
 
-    def _tune_from(self, rule: TuningRule, own: PhaseTuning) -> _Attempt:
+    def _tune_from(self, rule: TuningRule, own: PhaseTuning) -> PhaseTuning:
         """Tune it from certain torques."""
         own, bench = replace(own, quasistatic=rule.scale(0)), rule.bench
         drives = rule.drive()
         drives = drives[: 1 + round(self.share * (len(drives) - 1))]
         if not drives:
-            return self._sum_up(own, bench, bench.trials[-1]), None, _explain(bench)
+            return _sum_up(own, bench, bench.trials[-1], reason=_explain(bench))
         if not self.brake:
-            return self._arrive(own, rule, drives)
+            # The fastest that is held where it arrives; the slowest arrives most gently.
+            held = None
+            for drive in drives:
+                attempt = self._hold(replace(own, raised=drive.raised), rule, drive.trial)
+                if attempt.end is None:
+                    return held or attempt
+                held = attempt
+            assert held is not None
+            return held
         stopped = rule.brake(drives)
         if stopped is None:
             text = "no torque in steps of 10 % brings it to rest at its end: a trial "
-            own = replace(self._sum_up(own, bench, drives[-1].trial), raised=drives[-1].raised)
-            return own, None, text + bench.trials[-1].to_text()
+            text += bench.trials[-1].to_text()
+            return _sum_up(own, bench, drives[-1].trial, raised=drives[-1].raised, reason=text)
         drive, brake = stopped
         own = replace(own, raised=drive.raised, braked=brake.raised, supported=brake.supported)
         return self._hold(own, rule, brake.trial)
 
-    def _arrive(
-        self, own: PhaseTuning, rule: TuningRule, drives: Sequence[TuningDrive]
-    ) -> _Attempt:
-        """The fastest drive that is held where it arrives; the slowest arrives most gently."""
-        kept: list[_Attempt] = []
-        for drive in drives:
-            kept.append(self._hold(replace(own, raised=drive.raised), rule, drive.trial))
-            if kept[-1][1] is None:
-                break
-        return kept[-2] if kept[-1][1] is None and kept[1:] else kept[-1]
-
-    def _hold(self, own: PhaseTuning, rule: TuningRule, trial: TuningTrial) -> _Attempt:
+    def _hold(self, own: PhaseTuning, rule: TuningRule, trial: TuningTrial) -> PhaseTuning:
         """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
-        own = replace(self._sum_up(own, rule.bench, trial), steps=trial.steps)
-        reason, until = "", self.passage.until
+        unit = "rad/s" if rule.bench.is_angle else "m/s"
+        rate = f"{trial.rate:.3g} {unit} at t = {trial.time:.5g} s"
         for tau in self._list_holds(rule, trial):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
             z, text = rule.bench.land(steps, trial.time, trial.time + self.pause)
-            own = replace(own, steps=steps, simulations=rule.bench.simulations)
+            own = _sum_up(own, rule.bench, trial, steps=steps, end=None if text else z)
             if not text:
-                return own, z, ""
-            unit = "rad/s" if rule.bench.is_angle else "m/s"
-            rate = f"{until} is reached at {trial.rate:.3g} {unit} at t = {trial.time:.5g} s"
-            reason = f"{rate}, and {text}"
-        return own, None, reason
+                break
+            own = replace(own, reason=f"{self.passage.until} is reached at {rate}, and {text}")
+        return own
 
     def _list_holds(self, rule: TuningRule, trial: TuningTrial) -> list[tuple[float, float] | None]:
         """What may hold the object: what it arrives with, or quasistatic torques lowered.
@@ -654,16 +644,12 @@ class _Setting(NamedTuple):
             return None
         return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())
 
-    def _sum_up(self, own: PhaseTuning, bench: Bench, trial: TuningTrial) -> PhaseTuning:
-        return replace(
-            own,
-            duration=trial.time,
-            rate=trial.rate,
-            least=trial.least,
-            weakest=trial.weakest,
-            trials=tuple(bench.trials),
-            simulations=bench.simulations,
-        )
+
+def _sum_up(own: PhaseTuning, bench: Bench, trial: TuningTrial, **more: Any) -> PhaseTuning:
+    """The tuning of a phase with the numbers of a trial, and what it took."""
+    more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
+    more |= {"weakest": trial.weakest, "trials": tuple(bench.trials)}
+    return replace(own, simulations=bench.simulations, **more)
 
 
 def _explain(bench: Bench) -> str:

@@ -71,10 +71,17 @@ class Queries(Study):
 
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one."""
-        *_, objective, ways = case
-        problem, answer, row = ask_route(case)
-        if answer is None:
-            return row
+        drawn, seed, number, folder, objective, ways = case
+        problem = DRAW[drawn](seed, number, Path(folder))
+        forget_roadmaps()
+        row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
+        started = time.process_time()
+        try:
+            answer = find_route(problem, objective)
+        except WholearmError as error:
+            row["kind"] = "blocked" if isinstance(error, InfeasibleError) else "no answer"
+            return row | {"why": str(error), "first": time.process_time() - started}
+        row["first"] = time.process_time() - started
         row |= {"gap": answer.gap, "value": answer.plan.value, "phases": len(answer.plan.phases)}
         failures = verify(answer.problem, answer.plan).failures
         if failures:
@@ -211,24 +218,6 @@ def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
 
 
 DRAW = {"query": draw_query, "polygon": draw_polygon_query}
-
-
-def ask_route(case: Case) -> tuple[Problem, Answer | None, Row]:
-    """A problem with a goal, its route, if any, and a row with processor time or reason.
-
-    The case begins with what is drawn, its seed and number, folder of the problems, and objective.
-    """
-    drawn, seed, number, folder, objective, *_ = case
-    problem = DRAW[drawn](seed, number, Path(folder))
-    forget_roadmaps()
-    row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
-    answer, started = None, time.process_time()
-    try:
-        answer = find_route(problem, objective)
-    except WholearmError as error:
-        row["kind"] = "blocked" if isinstance(error, InfeasibleError) else "no answer"
-        row["why"] = str(error)
-    return problem, answer, row | {"first": time.process_time() - started}
 
 
 def _draw_corners(rng: np.random.Generator, count: int) -> list[list[float]]:

@@ -198,6 +198,14 @@ def format_csv(rows: Iterable[Mapping[str, Any]], heads: Iterable[str]) -> str:
     return stream.getvalue()
 
 
+def write_svg(figure: Any) -> str:
+    """The drawing of a figure as SVG, without the head of a file."""
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]
+
+
 class Brief:
     """What is one line as a `repr`."""
 
@@ -220,10 +228,7 @@ class Drawn(Brief):
             name, function = "map_figure", "draw_map"
         # Figures stand on everything else, so that nothing loads them before it is drawn.
         figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
-        stream = io.StringIO()
-        figure.savefig(stream, format="svg")
-        picture = stream.getvalue()
-        return f"<p>{escape(repr(self))}</p>{picture[picture.index('<svg') :]}"
+        return f"<p>{escape(repr(self))}</p>{write_svg(figure)}"
 
 
 class Result(Brief):

@@ -148,9 +148,8 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> None:
     pieces, _, order = torque.coefficients.shape
     x = np.linspace(-1.0, 1.0, 2 if order <= 2 else max(order, math.ceil(2000 / pieces)))
     middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
-    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
-    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
-    t, tau = (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
+    tau = torque.at_places(x).transpose(0, 2, 1).reshape(-1, 2)
+    t = (middle[:, None] + half[:, None] * x).ravel()
     for index, (colour, _) in enumerate(style.FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
         axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)

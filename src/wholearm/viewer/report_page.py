@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import platform
@@ -12,11 +11,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
 from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
-from ..common.document import Document, Table, fixed, show
+from ..common.document import Document, Table, fixed, show, write_svg
 from ..common.files import make_folder, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
@@ -70,7 +68,7 @@ def build_report(
 
         result = find_sensitivities(comparison.contenders[0].problem or problem, progress=progress)
         parts += ["<h2>What 1 % more of each number is worth</h2>"]
-        parts += [_write_svg(draw_sensitivities(result)), result.document.to_html()]
+        parts += [write_svg(draw_sensitivities(result)), result.document.to_html()]
     progress("map")
     chart = chart or build_map(problem, 90, choose_window(problem, None))
     machine = f"Python {platform.python_version()}, {platform.machine()}"
@@ -82,14 +80,6 @@ def build_report(
         Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
     return page.build_page(problem.name, parts)
-
-
-def _write_svg(figure: Figure) -> str:
-    """The drawing of a figure, without the head of a file."""
-    stream = io.StringIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None})
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
 
 
 def _describe(contender: Contender, most: int) -> list[str]:
@@ -173,7 +163,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
     scene = chart.problem.scene
     with matplotlib.rc_context(STYLE | {"svg.fonttype": "none"}):
         # Its style for nothing else in the page.
-        drawing = _write_svg(draw_map(chart, plan)).replace("*{", ".map *{")
+        drawing = write_svg(draw_map(chart, plan)).replace("*{", ".map *{")
     parts = list(split(chart.cell))
     step = np.array([np.ptp(chart.phi) / len(chart.phi), np.ptp(chart.x) / len(chart.x)])
     rooms = [find_room(region, step / np.ptp(chart.x)) for _, region in parts]
