@@ -532,7 +532,7 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     zero = TorqueProfile(plan.torque.breaks, 0.0 * plan.torque.coefficients)
     _, violation, outcome = check_plan(phase(4), plan._replace(torque=zero))
     assert "contact is lost" in outcome and violation > 0.02
-    assert check_plan(phase(4), plan._replace(status="stopped"))[2] == "stopped"
+    assert check_plan(phase(4), "stopped")[2] == "stopped"
 
 
 @lru_cache

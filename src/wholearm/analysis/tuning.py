@@ -122,20 +122,7 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
 
 
 class Bench:
-    """Trials of one passage from one start.
-
-    Parameters
-    ----------
-    z : (5,)  where it starts, at rest
-    tell      shown each trial, in words
-
-    Attributes
-    ----------
-    trials
-    simulations       trials, and landings
-    way : [m or rad]  how far away the end is
-    is_angle          whether the end of the passage is one of phi
-    """
+    """Trials of one passage from rest at `z`, shape (5,); `tell` is shown each, in words."""
 
     def __init__(
         self, problem: Problem, passage: Passage, z: Array, tell: Callable[[str], None]
@@ -148,10 +135,10 @@ class Bench:
         self.column = 0 if until.coordinate == "x" else 2
         self.value = math.nan if until.value is None else until.value
         self.sign = float(np.sign(z[self.column] - self.value))
-        self.way = float(self.measure(z[None])[0])
-        self.is_angle = self.pair is None and self.column == 2
+        self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
+        self.is_angle = self.pair is None and self.column == 2  # whether the end is one of phi
         self.trials: list[TuningTrial] = []
-        self.simulations = 0
+        self.simulations = 0  # trials, and landings
 
     def measure(self, z: Array) -> Array:
         """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
@@ -616,12 +603,11 @@ class _Setting(NamedTuple):
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
             for n in range(1, SETTINGS.hold)
         ]
+        arrived, held = np.array(trial.steps[-1].tau), []
         if after is None:
-            arrived = np.array(trial.steps[-1].tau)
             arrived[1 - acting] /= FACTOR**SETTINGS.hold
             held = [tuple((arrived / FACTOR ** (SETTINGS.hold * n)).tolist()) for n in range(3)]
-            return [None, *lowered, *held]
-        return [None, *lowered]
+        return [None, *lowered, *held]
 
     def _balance(self, phases: Sequence[Phase], z: Array) -> tuple[Array, int] | None:
         """Torques of a quasistatic motion from `z`, (n, 2), as far as one keeps every contact.

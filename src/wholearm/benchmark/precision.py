@@ -110,14 +110,10 @@ def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance,
 
 
 class PeerPlan(NamedTuple):
-    """What a planner has found for one phase."""
+    """What a planner has found for one phase; a text takes its place that says why it has not."""
 
-    status: str  # `SOLVED`, or why there is no plan
     duration: float  # [s]
     torque: TorqueProfile
-
-
-NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))))
 
 
 def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
@@ -324,10 +320,9 @@ def build_own(course: Course, setting: str) -> Callable[[], Array]:
 
     What it keeps of a formation is built by a first run.
     """
-    tolerance = float(setting)
 
     def run() -> Array:
-        simulation = simulate(course.problem, course.torque, tolerance=tolerance)
+        simulation = simulate(course.problem, course.torque, tolerance=float(setting))
         return np.append(simulation.z[-1], simulation.z_dot[-1])
 
     run()
@@ -415,7 +410,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     return Course(problem, torque, spans, end)
 
 
-def check_plan(instance: Instance, plan: PeerPlan) -> tuple[float, float, str]:
+def check_plan(instance: Instance, plan: PeerPlan | str) -> tuple[float, float, str]:
     """Replay a plan.
 
     Returns
@@ -424,8 +419,8 @@ def check_plan(instance: Instance, plan: PeerPlan) -> tuple[float, float, str]:
     violation  worst of c_n >= epsilon, over the scene's force, or of a torque limit, over it
     outcome    `SOLVED`, or why the plan is none
     """
-    if plan.status != SOLVED:
-        return math.nan, math.nan, plan.status
+    if isinstance(plan, str):
+        return math.nan, math.nan, plan
     problem, curve = instance.problem, instance.curve
     reversals = len(curve.segments) - 1
     state, _, least = integrate(problem, plan.torque, curve, reversals, 1e-10)
@@ -465,9 +460,9 @@ def run_planner(instance: Instance, method: str, setting: str) -> Median:
         __import__(module)
     least = find_least_time(instance)
 
-    def judge(plan: PeerPlan) -> tuple[tuple[float, ...], str]:
+    def judge(plan: PeerPlan | str) -> tuple[tuple[float, ...], str]:
         end, violation, outcome = check_plan(instance, plan)
-        error = plan.duration / least - 1 if plan.status == SOLVED else math.nan
+        error = math.nan if isinstance(plan, str) else plan.duration / least - 1
         return (error, end, violation), outcome
 
     return measure(partial(PLANNERS[method].build, instance, setting), judge)
@@ -496,7 +491,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
 
     def run() -> PeerPlan:
         plan = plan_path(curve, epsilon, options, 1)
-        return PeerPlan(SOLVED, plan.motion.duration, plan.torque)
+        return PeerPlan(plan.motion.duration, plan.torque)
 
     return run
 
@@ -509,7 +504,7 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]
 
     def run() -> PeerPlan:
         (plan,) = plan_phases(problem, problem.phases, problem.start, options)
-        return PeerPlan(SOLVED, plan.motion.duration, plan.torque)
+        return PeerPlan(plan.motion.duration, plan.torque)
 
     return run
 
@@ -522,7 +517,7 @@ def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[Path
     return forces, PathLimits.of(limits, forces, point.z_s[:, 3:])
 
 
-def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan | str]:
     """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
     import toppra
     from toppra.constraint import DiscretizationType, LinearConstraint
@@ -559,10 +554,10 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
     planner = toppra.algorithm.TOPPRA([Limits()], path, gridpoints=grid, **options)
 
-    def run() -> PeerPlan:
+    def run() -> PeerPlan | str:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
         if speeds is None or not np.isfinite(speeds).all():
-            return NO_PLAN._replace(status="no feasible parametrisation")
+            return "no feasible parametrisation"
         return _make_plan(instance, grid, np.asarray(speeds))
 
     return run
@@ -600,10 +595,10 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
 
     profile = TorqueProfile.fit(times, torque, 4)
-    return PeerPlan(SOLVED, float(times[-1]), profile)
+    return PeerPlan(float(times[-1]), profile)
 
 
-def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan | str]:
     """A phase for every stretch, with contact forces among the controls, on Legendre-Gauss points.
 
     The slow motion is the first guess.
@@ -652,10 +647,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     }.items():  # fmt: skip
         setattr(ocp.ipopt_options, name, value)
 
-    def run() -> PeerPlan:
-        return _read(ocp.solve())
-
-    return run
+    return lambda: _read(ocp.solve())
 
 
 def _write_functions(ocp: Any, instance: Instance) -> None:
@@ -694,18 +686,17 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
         ocp.functions.discrete = discrete
 
 
-def _read(solution: Any) -> PeerPlan:
+def _read(solution: Any) -> PeerPlan | str:
     """The torques linear between collocation points: their polynomials swing wide in between."""
-    status = solution.nlp_info.ipopt_status
-    if status != 0:
-        return NO_PLAN._replace(status=str(solution.nlp_info.ipopt_status_message))
+    if solution.nlp_info.ipopt_status != 0:
+        return str(solution.nlp_info.ipopt_status_message)
     times, rows = [], []
     for phase in solution.phase:
         tau = np.asarray(phase.control)[:2].T
         times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
         rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
     torque = TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
-    return PeerPlan(SOLVED, float(times[-1][-1]), torque)
+    return PeerPlan(float(times[-1][-1]), torque)
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")

@@ -235,8 +235,7 @@ problems PROBLEM ...   problem files (TOML)
 --jobs N               worker processes (default: all cores) in 1..256
 --scheduler ADDRESS    run on the cluster of this Dask scheduler (extra: cluster)
 --time-limit S         longest time for one point (none) in 1e-3..1e9
-{PLANNING}\
---json                 print the result as JSON
+{PLANNING}{JSON}\
 [[sensitivities]]  sensitivities  see what 1 percent more of each number in a problem file is worth
 problem            problem file (TOML)
 [plan]             trajectory file (.npz) of its plan, whose objective and options count
@@ -244,8 +243,7 @@ problem            problem file (TOML)
 --differences      between solved problems, also where multipliers give derivatives
 -o --output FILE   figure to write (.png, .pdf, .svg): a bar for each number
 --jobs N           processes (default: all cores) in 1..256
-{PLANNING}\
---json             print the result as JSON
+{PLANNING}{JSON}\
 [[design]]  find_hand  find the hand that does a job best
 problems PROBLEM ...   problem files (TOML), for one hand
 --over NAME=LOW:HIGH ...  numbers to choose and their ranges, by the names of Problem.with_, as in
@@ -261,8 +259,7 @@ problems PROBLEM ...   problem files (TOML), for one hand
     that of the first one
 --figure FILE          also draw the path of the search (.png, .pdf, .svg)
 --jobs N               processes (default: all cores) in 1..256
-{PLANNING.replace(OBJECTIVE, "")}\
---json                 print the result as JSON
+{PLANNING.replace(OBJECTIVE, "")}{JSON}\
 [[animate]]  animate  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
