@@ -676,7 +676,7 @@ def _header(shape: str, kind: str) -> bytes:
 )
 def test_an_array_has_to_hold_what_it_claims(tmp_path: Path, shape: str, kind: str) -> None:
     path = _write(tmp_path / "a.npz", {"t": _header(shape, kind)})
-    with pytest.raises(InputError, match=r"a\.npz: t: claims \d+ bytes of .* and holds 24"):
+    with pytest.raises(InputError, match=r"a\.npz: t: is no array of numbers or text: "):
         read_arrays(path, ("t",))
 
 
@@ -684,7 +684,7 @@ def test_objects_are_not_unpickled(tmp_path: Path) -> None:
     stream = io.BytesIO()
     np.lib.format.write_array(stream, np.array([{}], dtype=object), allow_pickle=True)
     path = _write(tmp_path / "a.npz", {"t": stream.getvalue()})
-    with pytest.raises(InputError, match="Python objects"):
+    with pytest.raises(InputError, match="t: is no array of numbers or text: Object arrays"):
         read_arrays(path, ("t",))
 
 

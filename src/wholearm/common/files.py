@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import os
 import threading
 from collections import deque
@@ -151,12 +149,14 @@ on_end(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
 def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
     """Read the named arrays of an archive, as far as it has them.
 
-    Nothing is unpickled, and no array takes more memory than its bytes in the file. An `InputError`
-    if it cannot be read, is no archive of arrays, or claims what it does not hold.
+    Nothing is unpickled. An `InputError` if it cannot be read, is no archive of arrays, or claims
+    what it does not hold.
     """
-    # A command that reads none has no use for these, nor for NumPy.
+    # A command that reads none has no use for these.
     import zipfile
     import zlib
+
+    import numpy as np
 
     source, arrays = str(path), dict[str, Any]()
     try:
@@ -172,29 +172,14 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
                     if info.file_size > LARGEST:
                         problem = f"holds {info.file_size} bytes; allowed are up to {LARGEST}"
                         raise InputError(source, name, problem)
-                    with archive.open(info) as member:
-                        arrays[name] = _read_array(source, name, member.read())
+                    try:
+                        with archive.open(info) as member:
+                            arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+                    except (ValueError, OverflowError, MemoryError) as error:
+                        text = f"is no array of numbers or text: {error}"
+                        raise InputError(source, name, text) from None
     except OSError as error:
         raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
     except (ValueError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
         raise InputError(source, "", f"is not a trajectory file: {e}") from None
     return arrays
-
-
-def _read_array(source: str, name: str, content: bytes) -> Any:
-    """The array whose ``.npy`` file has the given bytes."""
-    import numpy as np
-
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of the array format is unknown")
-    read = np.lib.format.read_array_header_1_0
-    shape, _, kind = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(stream)
-    if kind.hasobject:
-        raise InputError(source, name, "holds Python objects; numbers or text are needed")
-    claimed, stored = math.prod(shape) * kind.itemsize, len(content) - stream.tell()
-    if min(shape, default=0) < 0 or claimed != stored:
-        raise InputError(source, name, f"claims {claimed} bytes of {shape} and holds {stored}")
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
