@@ -22,7 +22,7 @@ from ..results.plan_record import Deviation
 from ..results.report import ContactMargin, Failure, FingerGap, PhaseReport, UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from ..simulation.events import EventKind, OutcomeKind, Simulation
+from ..simulation.events import EventKind, Simulation
 
 DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
@@ -59,34 +59,6 @@ class Allowance:
     def measure_stray(self, problem: Problem) -> float:
         """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
         return 5e-7 * problem.scene.scales.force + self.stray * problem.epsilon
-
-
-def judge_end(simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
-    """Whether the goal is reached, and the sentence that says how the replay ended.
-
-    By rounding the torques may end within a hair of the goal.
-    """
-    problem, outcome = simulation.problem, simulation.outcome
-    last, length = problem.phases[-1], problem.scene.scales.length
-    if outcome.reached:
-        return True, outcome.text
-    missed = abs(simulation.missed_by)
-    start = simulation.z[np.searchsorted(simulation.phase, simulation.phase[-1])]
-    is_angle = last.until.lead(start, length).coordinate == "phi"
-    near = (
-        outcome.kind is OutcomeKind.GOAL_MISSED
-        and int(simulation.phase[-1]) == last.index
-        and missed <= 3e-4 * (1.0 if is_angle else length)
-        and measure_speed(problem.scene, simulation.z_dot[-1])
-        <= allowance.rest_speed * problem.scene.scales.speed
-    )
-    if not near:
-        return False, outcome.text
-    unit = "rad" if is_angle else "m"
-    return True, (
-        f"{last.until} is reached to {missed:.1g} {unit} at t = {simulation.t[-1]:.5g} s, "
-        f"the end of phase {last.number}"
-    )
 
 
 def measure_speed(scene: Scene, v: Array) -> float:

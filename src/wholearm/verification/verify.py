@@ -183,7 +183,7 @@ def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False
     """Apply tolerances to a replay; see `verify`."""
     simulation, phases, gap = seen.simulation, seen.phases, seen.gap
     problem, torque = simulation.problem, simulation.torque
-    reached, outcome = verdict.judge_end(simulation, allowance)
+    reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += verdict.describe_failures(simulation, phases, gap if reached else None, allowance)
     thin = list(verdict.describe_thin_margins(simulation, phases, allowance))
