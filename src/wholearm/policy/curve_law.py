@@ -68,6 +68,7 @@ class LawSettings:
 
 LAW = LawSettings()
 Rows = list[list[float]]
+Levels = tuple[list[float], list[float], list[float]]  # and their coefficients of a and lambda
 
 
 class CurveLaw:
@@ -99,6 +100,7 @@ class CurveLaw:
         self.keeps = bool(tables.get("keeps", [0.0])[0])
         pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
         self.steps = [after - before for before, after in pairs]
+        self.borders = [self.nodes.index(start) for start in self.starts[1:]]
         self.chords = [
             (after[0] - before[0], after[1] - before[1])
             for before, after in zip(self.theta, self.theta[1:], strict=False)
@@ -182,15 +184,17 @@ class CurveLaw:
         # Faster than 0.4 of the touching speed, so that no friction reverses while braking.
         slowest = (0.4 * settings.touch - (v - half * self.a)) / (settings.period + settings.delay)
         # Over a border the mean of the reference is that of no place. Case: query 32, phase 6.
-        local = (self.b[j + 1] - self.b[j]) / (2.0 * self.steps[j])
-        return self._act(j, share, v, (planned, local), max(a, slowest), s >= self.length)
+        sides = [j, *(k - (j >= k) for k in self.borders if abs(self.nodes[k] - s) < reach)][:2]
+        local = [(self.b[k + 1] - self.b[k]) / (2.0 * self.steps[k]) for k in sides]
+        across = sides[1] if sides[1:] else None
+        return self._act(j, share, v, [planned, *local], max(a, slowest), s >= self.length, across)
 
     def hold(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that press this law's contacts and bring the joints to rest [N m]."""
         self._measure(theta, rates)
         v = self.v + (self.settings.delay + 0.5 * self.settings.period) * self.a
         j, share = self._locate(self.j, self.s)
-        return self._act(j, share, v, (0.0,), -self.gain * v)
+        return self._act(j, share, v, [0.0], -self.gain * v)
 
     def slow_down(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that bring the joints to rest, without those that press contacts [N m]."""
@@ -270,9 +274,7 @@ class CurveLaw:
             floors.append(min(LAW.level, LAW.part * level))
         return floors
 
-    def _list_levels(
-        self, j: int, share: float, v: float
-    ) -> tuple[list[float], list[float], list[float]]:
+    def _list_levels(self, j: int, share: float, v: float) -> Levels:
         """Levels at a place and a speed, and their coefficients of a and internal force."""
         b = v * v
         base, rates, press = [], [], []
@@ -284,41 +286,65 @@ class CurveLaw:
             press.append(cl + share * dl)
         return base, rates, press
 
+    def _list_torques(self, j: int, share: float, v: float) -> list[tuple[float, float, float]]:
+        """Torques at a place and a speed, and their coefficients of a and internal force."""
+        torques = []
+        for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
+            self.torque[j], self.torque_rises[j], strict=True
+        ):
+            moving = c + share * d + (cb + share * db) * v * v + (cv + share * dv) * v
+            torques.append((moving, ca + share * da, cl + share * dl))
+        return torques
+
+    def _list_levels_across(
+        self, torques: Sequence[tuple[float, float, float]], j: int, share: float, v: float
+    ) -> Levels:
+        """As `_list_levels`, of another place under torques that are affine in this one's a."""
+        base, rates, press = self._list_levels(j, share, v)
+        (p, d, e), (q, f, g) = self._list_torques(j, share, v)
+        size = d * g - e * f
+        if abs(size) <= SAME * (abs(d * g) + abs(e * f)):
+            return [], [], []
+        # a and internal force there, of 1, a and internal force here
+        pairs = list(zip(*torques, strict=True))
+        pairs[0] = pairs[0][0] - p, pairs[0][1] - q
+        a = [(g * one - e * two) / size for one, two in pairs]
+        internal = [(d * two - f * one) / size for one, two in pairs]
+        every = list(zip(base, rates, press, strict=True))
+        base, rates, press = (
+            [(k == 0) * level + rate * a[k] + by * internal[k] for level, rate, by in every]
+            for k in range(3)
+        )
+        return base, rates, press
+
     def _act(
         self,
         j: int,
         share: float,
         v: float,
-        planned: tuple[float, ...],
+        planned: Sequence[float],
         a: float,
         beyond: bool = False,
+        across: int | None = None,
     ) -> tuple[float, float]:
         """Torques for an acceleration within limits; `beyond` the end no forces are planned.
 
         Where it keeps them too little it is moved towards that of some `planned` that keeps them
-        best.
+        best. Limits of the interval `across` a border are kept by the same torques.
         """
-        b = v * v
-        base, rates, press = self._list_levels(j, share, v)
-        level, internal = choose_internal_force(base, rates, press, a)
-        floor = self.floor[j]
-        if level < floor:
-            (safe, other), best = max(
-                (choose_internal_force(base, rates, press, one), one) for one in planned
-            )
-            if safe > floor:
-                # The least level is concave in a: this interpolation keeps the floor.
-                a = best + (safe - floor) / (safe - level) * (a - best)
-                level, internal = choose_internal_force(base, rates, press, a)
-            elif safe > level:
-                a, level, internal = best, safe, other
+        rows, torques = self._list_levels(j, share, v), self._list_torques(j, share, v)
+        wanted, floor = a, self.floor[j]
+        a, level, internal = _choose_motion(rows, planned, wanted, floor)
+        if across is not None:
+            more = self._list_levels_across(torques, across, float(across < j), v)
+            base, rates, press = (one + two for one, two in zip(rows, more, strict=True))
+            both = _choose_motion((base, rates, press), planned, wanted, floor)
+            # Where none keep both, the longer part counts. Case: query 32, phase 6.
+            if both[1] > 0.0:
+                a, level, internal = both
         self.a, self.level = a, level
-        tau, low, high = list[tuple[float, float]](), -1e30, 1e30
-        for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
-            self.torque[j], self.torque_rises[j], strict=True
-        ):
-            moving = c + share * d + (cb + share * db) * b + (cv + share * dv) * v
-            tau.append((moving + (ca + share * da) * a, cl + share * dl))
+        tau = [(moving + by_a * a, by) for moving, by_a, by in torques]
+        low, high = -1e30, 1e30
         one, two = self.settings.limit
         if self.sensing is not None and self.sensing.heard and not beyond:
             for (moving, by), most in zip(tau, (one, two), strict=True):
@@ -348,6 +374,21 @@ class CurveLaw:
         self.rested = self.rested + settings.period if abs(v) < settings.still else 0.0
         self.over = self.rested > dwell + settings.delay
         return tau
+
+
+def _choose_motion(
+    rows: Levels, planned: Sequence[float], a: float, floor: float
+) -> tuple[float, float, float]:
+    """a, the least level and the internal force, with a moved to one planned below the floor."""
+    level, internal = choose_internal_force(*rows, a)
+    if level >= floor:
+        return a, level, internal
+    (safe, other), best = max((choose_internal_force(*rows, one), one) for one in planned)
+    if safe > floor:
+        # The least level is concave in a: this interpolation keeps the floor.
+        a = best + (safe - floor) / (safe - level) * (a - best)
+        return (a, *choose_internal_force(*rows, a))
+    return (best, safe, other) if safe > level else (a, level, internal)
 
 
 def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows]]:
