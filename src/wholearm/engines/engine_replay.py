@@ -133,10 +133,11 @@ class EngineReport(Result):
             errors.append([stretch.name, stretch.duration, *largest, *sampled])
             for force in departure.forces:
                 forces.append((*force, force.off if force.planned > PRESS * scales.force else None))
-        levels = list[list[Any]]()
-        for level in self.levels if len(self.levels) > 1 else ():
-            farthest = [np.max(departure.position) for departure in level.departures]
-            levels.append([level.setting.step * scales.time, level.setting.softness, *farthest])
+        levels = [
+            [each.setting.step * scales.time, each.setting.softness]
+            + [np.max(departure.position) for departure in each.departures]
+            for each in (self.levels if len(self.levels) > 1 else ())
+        ]
         lines.append(
             f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
             "torques contain the dry friction of the joints, with its planned signs"
@@ -157,22 +158,14 @@ class EngineReport(Result):
     @property
     def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad, s and N; null where an engine fails."""
-        scales = self.problem.scene.scales
-        return {
-            "problem": self.problem.name,
-            "engine": self.title,
-            "ok": self.ok,
-            "converged": self.converged,
-            "allowed": {"position": self.allowed * scales.length, "angle": self.allowed},
-            "levels": [
-                {
-                    "step": level.setting.step * scales.time,
-                    "softness": level.setting.softness,
-                    "stretches": list(map(_describe, self.stretches, level.departures)),
-                }
-                for level in self.levels
-            ],
-        }
+        scales, levels = self.problem.scene.scales, list[dict[str, Any]]()
+        for level in self.levels:
+            stretches = list(map(_describe, self.stretches, level.departures))
+            setting = {"step": level.setting.step * scales.time, "softness": level.setting.softness}
+            levels.append({**setting, "stretches": stretches})
+        values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
+        allowed = {"position": self.allowed * scales.length, "angle": self.allowed}
+        return {**values, "converged": self.converged, "allowed": allowed, "levels": levels}
 
 
 def _describe(stretch: EngineStretch, found: Departure) -> dict[str, Any]:
