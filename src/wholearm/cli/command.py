@@ -327,11 +327,11 @@ def _silence_output() -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are ours; pairs of numbers that begin with a minus are no options."""
+    """A parser whose errors are ours; -margin and numbers with a minus before are no options."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._negative_number_matcher = re.compile(r"-\.?\d")
+        self._negative_number_matcher = re.compile(r"-(\.?\d|margin$)")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; a command refuses what it does not know in its own name."""
@@ -395,8 +395,6 @@ def prepare(given: Sequence[str]) -> list[str]:
         text = left.pop(0)
         if text == "--simulate":
             text += f"={left.pop(0) if left and left[0] in SIMULATORS else SIMULATORS[0]}"
-        if text == "--minimise" and left:
-            text += f"={left.pop(0)}"  # -margin is no option
         texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
     return texts
 

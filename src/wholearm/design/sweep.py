@@ -280,11 +280,8 @@ def sweep(
     checks           of "verify", "free" and "policy": what plans are tried with besides the replay
                      that is part of planning
     time_limit : [s] for planning one point
-    path             file to which rows are written as they come. A sweep that is there already goes
-                     on where it was stopped, and ends the same to the last bit, unless it is to be
-                     `fresh`.
-    fresh            begin the file anew, whatever it holds
-    start            makes a `concurrent.futures.Executor`; processes on all cores if left out
+    path, fresh      file to which rows are written as they come, and whether it is begun anew
+    start            what makes processes; these three as of `assess_robustness`
     progress         told how many points are done, and the time that is left
     **options        as `wholearm.solve` takes them
 

@@ -44,14 +44,10 @@ class Allowance:
     InputError if one of the first three is not positive, or the last is 1 or more.
     """
 
-    # distance from the plan, over the scene's length for positions and in rad for angles
-    departure: float = DEPARTURE
-    # speed where a phase ends at rest, over the scene's speed; angular speeds count times the
-    # scene's length
+    departure: float = DEPARTURE  # departure, rest_speed: as of `verify`
     rest_speed: float = REST_SPEED
     stray: float = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
-    # least uniqueness margin of contact forces (`mechanics.uniqueness`)
-    uniqueness_margin: float = UNIQUENESS_MARGIN
+    uniqueness_margin: float = UNIQUENESS_MARGIN  # least one of contact forces
 
     def __post_init__(self) -> None:
         read_keys(self)
