@@ -80,11 +80,8 @@ def predict(
 def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
     """Quasistatic torques of all phases over time, as if each were run through at a mean speed.
 
-    They balance friction, and set nothing in motion: hand tuning starts from there.
-
-    Parameters
-    ----------
-    speed : [m/s]  along the phases
+    They balance friction, and set nothing in motion: hand tuning starts from there. The mean speed
+    is along the phases [m/s].
 
     InfeasibleError if a phase has no quasistatic torques.
     """
@@ -150,10 +147,7 @@ def _predict_phase(
 def find_torques(path: PathSamples, epsilon: float, share: float) -> QuasistaticTorques | None:
     """Torques that balance a quasistatic motion at all places of a path; None if some have none.
 
-    Parameters
-    ----------
-    epsilon : [N]
-    share          internal force; see `predict`
+    They keep `epsilon` [N], with a `share` of the internal force as of `predict`.
     """
     zero = np.zeros_like(path.s)
     best = path.force_limits.find_best(zero, zero)

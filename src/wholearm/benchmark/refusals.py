@@ -252,10 +252,8 @@ def fast_margin(
 ) -> float:
     """Margin of the best motion along a curve.
 
-    Parameters
-    ----------
-    curve  as of `event_tracing.resample`
-    rests  whether the motion is at rest at the start and at the end of the curve
+    The curve (s, z, z_s) is as of `resample`; `rests` says whether the motion is at rest at its
+    start and at its end.
     """
     s, z, z_s = curve
     with np.errstate(divide="ignore"):
@@ -451,13 +449,9 @@ def _solve_at_rest(
     """Margin in one way.
 
     Unknowns: the acceleration over the scene's, c_n and c_t over the weight, dry friction of the
-    joints over its bound, and the margin.
-
-    Parameters
-    ----------
-    N : (5, f)  accelerations that keep the contacts
-    rates       rates of contacts and joints, shape (n_c + 2, f), their signs, and rates of other
-                gaps
+    joints over its bound, and the margin. Columns of N, (5, f), are accelerations that keep the
+    contacts; `rates` are those of contacts and joints, (n_c + 2, f), their signs, and those of
+    other gaps.
     """
     slip, signs, apart = rates
     scales, f, n_c = scene.scales, N.shape[1], len(touches)

@@ -109,10 +109,7 @@ class _Share(Generic[_T]):
 class Store(Generic[_T]):
     """Values made of CasADi objects that several owners share, for as long as one of them lives.
 
-    Parameters
-    ----------
-    build     makes the value of an owner
-    identify  owners for which this is equal share one value
+    `build` makes the value of an owner; owners for which `identify` gives equal keys share one.
     """
 
     def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:

@@ -243,10 +243,8 @@ def record(
 ) -> EngineRun:
     """Run an engine to the end of its steps, or until its policy is over.
 
-    Parameters
-    ----------
-    advance  takes the steps from one number to another; returns the mean forces of the pairs [N]
-    read     z and z_dot, (5,) each
+    `advance` takes the steps from one number to another, and returns the mean forces of the pairs
+    [N]; `read` returns z and z_dot, (5,) each.
     """
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
     for end in steps.ends:

@@ -121,10 +121,7 @@ class TorqueProfile:
     def join_rows(t: Array, tau: Array) -> TorqueProfile:
         """Linear torques between rows; two rows at one time are a step there.
 
-        Parameters
-        ----------
-        t : (n,) [s]        never decreasing, and increasing somewhere
-        tau : (n, 2) [N m]
+        Times t, (n,) [s], never decrease, and increase somewhere; tau is (n, 2) [N m].
         """
         pieces = np.flatnonzero(np.diff(t) > 0)
         middle, half = (tau[pieces] + tau[pieces + 1]) / 2, (tau[pieces + 1] - tau[pieces]) / 2
@@ -217,12 +214,9 @@ def place_rows(
 ) -> Array:
     """Rows (t, tau_1, tau_2) whose straight lines give torques back, shape (n, 3) [s, N m, N m].
 
-    Every break of the torques has a row, and two where they step by 1e-6 of the largest or more.
-
-    Parameters
-    ----------
-    error                      what the lines may miss, relative to the largest torque
-    rate_limit : (2,) [N m/s]  largest rates, which lines keep if the torques do
+    Every break of the torques has a row, and two where they step by 1e-6 of the largest or more. An
+    `error`, relative to the largest torque, is what the lines may miss. They keep a rate limit,
+    (2,) [N m/s], if the torques do.
     """
     peak = np.abs(torque.at_places(_PLACES)).max(axis=(0, 2))
     largest = float(peak.max())

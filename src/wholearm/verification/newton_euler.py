@@ -95,11 +95,9 @@ def balance(
 ) -> Balance:
     """Residuals of a motion with its forces in the Newton-Euler equations.
 
-    Parameters
-    ----------
-    contacts, rolling  in the order of the samples' forces; those of them that roll
-    still              speed that counts as none, relative to the scene's speed; angular speeds
-                       count times the scene's length
+    Contacts are in the order of the samples' forces; `rolling` are those of them that roll. Below
+    the speed `still`, relative to the scene's, angular ones times the scene's length, nothing
+    moves.
     """
     z, v, scales = samples.z, samples.z_dot, scene.scales
     slow = still * scales.speed

@@ -403,10 +403,8 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
 def find_lowest(t: Array, values: Array, shortest: float = 0.0) -> tuple[float, float]:
     """Least value of a smooth function and where, refined by parabolas through three samples.
 
-    Parameters
-    ----------
-    t, values : (n,)  times never decrease [s]
-    shortest : [s]    interval below which rounding spoils a parabola
+    Times t, (n,) [s], never decrease. Parabolas are spoiled by rounding in intervals below
+    `shortest`.
     """
     first = int(values.argmin())
     least, time = float(values[first]), float(t[first])
