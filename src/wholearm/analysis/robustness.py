@@ -113,12 +113,8 @@ def change_torques(
 ) -> TorqueProfile:
     """Torques as they are carried out: sampled and held, late, and of the wrong size.
 
-    Parameters
-    ----------
-    changes             `gain1`, `gain2` relative, and `delay` [s], during which the first torques
-                        hold
-    sample_rate : [Hz]
-    offset              share of a period by which the first sample is early, in [0, 1)
+    Changes are `gain1` and `gain2`, relative, and `delay` [s], during which the first torques hold.
+    The first sample at a rate [Hz] is early by a share `offset` of a period, in [0, 1).
     """
     breaks, coefficients = torque.breaks, torque.coefficients
     if sample_rate is not None:

@@ -272,11 +272,8 @@ def find_break(
 ) -> tuple[float | None, float | None, Least]:
     """The least speed at which less than a `wanted` force [N] is left, by bisection.
 
-    Parameters
-    ----------
-    wanted : [N]
-    unit : [m/s]   the scene's speed
-    above : [m/s]  speed up to which more than that is known to be left, if it is at rest
+    Up to the speed `above` [m/s] more than the `wanted` force [N] is known to be left, if it is at
+    rest; `unit` is the scene's speed [m/s].
 
     Returns
     -------

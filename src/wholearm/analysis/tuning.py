@@ -660,11 +660,8 @@ class TuningDrive(NamedTuple):
 class TuningRule:
     """The rule at work on one phase.
 
-    Parameters
-    ----------
-    tau : (2,) [N m]   quasistatic torques that are raised and lowered
-    last : (2,) [N m]  those at the end of the phase
-    acting             index of the acting finger
+    Quasistatic torques `tau`, (2,) [N m], are raised and lowered; `last` are those at the end of
+    the phase; `acting` is the index of the acting finger.
     """
 
     def __init__(self, bench: Bench, tau: Array, last: Array, acting: int) -> None:

@@ -314,12 +314,8 @@ def find_differences(
 ) -> Iterator[Difference]:
     """The keys in which two nested tables differ, in their order.
 
-    Parameters
-    ----------
-    one, other  mappings, lists, and what they hold
-    free        names, at any depth, in which they may differ; only at the top if they begin with a
-                dot
-    key         of the tables themselves
+    They hold mappings and lists. They may differ in names that are `free`, at any depth, or only at
+    the top if these begin with a dot; `key` is that of the tables themselves.
     """
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for name in dict.fromkeys([*one, *other]):

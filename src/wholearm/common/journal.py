@@ -21,13 +21,10 @@ class Journal:
     """A file of one JSON object per line, begun by a line that says what the study is.
 
     Nothing in the file is lost unless that is asked for. While the journal exists nobody else can
-    have one of the same file. Only a regular file has records: `os.devnull` stands for none.
-
-    Parameters
-    ----------
-    stamp  what the records belong to; `study` is its kind
-    fresh  begin the file anew, whatever it holds
-    again  drop records with findings, so that their tasks are run again
+    have one of the same file. Only a regular file has records: `os.devnull` stands for none. The
+    `stamp` is what the records belong to, its `study` their kind. A `fresh` file is begun anew,
+    whatever it holds; with `again`, records with findings are dropped, so that their tasks are run
+    again.
 
     InputError if the file holds something else, another study of the same kind included, or is
     being written by another run, or cannot be written.

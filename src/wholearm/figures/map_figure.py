@@ -304,11 +304,8 @@ def place_heads(points: Array, way: float) -> Array:
 def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) -> Array:
     """Places for the numbers of paths, on them or beside them, none over another, shape (m, 2).
 
-    Parameters
-    ----------
-    paths : (n, 2)    in units of the paper
-    size              diameter of the discs
-    low, high : (2,)  corners of the paper
+    Paths, (n, 2), the diameter `size` of the discs, and the corners `low` and `high` of the paper,
+    (2,), are in units of the paper.
     """
     angles = np.pi / 8 * (np.arange(16) + 4)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])

@@ -507,14 +507,8 @@ def reduce_to_first_joint(
     Eqs. (6)-(9) give (q', theta_2') = -P_AI^+ P_AII theta_1'. The equations of q and theta_2 give
     the contact forces, and that of theta_1 becomes the scalar equation. The pseudoinverse keeps the
     formula defined where P_AI is singular; where that is because theta_1 is stationary, the motion
-    is not a multiple of theta_1' and no such formula describes it.
-
-    Parameters
-    ----------
-    z : (5,)
-    theta_1_dot : [rad/s]
-    tau : (2,) [N m]
-    directions             signs of friction
+    is not a multiple of theta_1' and no such formula describes it. Configuration z is (5,),
+    theta_1' in rad/s, tau (2,) [N m]; directions are the signs of friction.
     """
     scene = formation.scene
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]

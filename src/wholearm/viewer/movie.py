@@ -126,11 +126,8 @@ def _trace_arc(base: Array, turn: float, radius: float) -> Array:
 class Movie:
     """A motion as pictures.
 
-    Parameters
-    ----------
-    ghost       a replay, drawn behind
-    speed       how fast the motion passes, over real time
-    resolution  dots per inch; it is 8 inches wide
+    A replay, the `ghost`, is drawn behind. The motion passes at `speed` over real time. At a
+    `resolution` in dots per inch it is 8 inches wide.
 
     InputError if `speed` is not positive, or makes the movie longer than two minutes.
     """
