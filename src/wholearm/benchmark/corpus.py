@@ -50,52 +50,47 @@ from .queries import draw_leg, draw_query
 from .scenes import draw_case
 from .study import Case, Findings, Row, Study, name_case
 
+FOUR = "heptagon_four_contacts"
 PROBLEMS = (
-    "box_rolling", "heptagon", "heptagon_four_contacts", "heptagon_impact", "heptagon_twice",
-    "hexagon", "square", "triangle",
+    "box_rolling", "heptagon", FOUR, "heptagon_impact", "heptagon_twice", "hexagon", "square",
+    "triangle",
 )  # fmt: skip
 OBJECTIVES = ("time", "effort", "margin")
 RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4, "geometry": 0.0}
 """Half widths of uncertain numbers."""
 VARIANTS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "dwell": ("heptagon_four_contacts", {"settle": "10 %"}, {}),
+    "dwell": (FOUR, {"settle": "10 %"}, {}),
     "dwell, landing": ("heptagon", {"settle": "10 %"}, {}),
     "dwell, effort": ("triangle", {"settle": 0.02}, {"objective": "effort"}),
     "dwell, impacts": ("heptagon_impact", {"settle": "10 %"}, {}),
-    "dwell, rate": ("heptagon_four_contacts", {"settle": 0.02, "torque_rate_limit": 500.0}, {}),
-    "rate": ("heptagon_four_contacts", {"torque_rate_limit": 500.0}, {}),
+    "dwell, rate": (FOUR, {"settle": 0.02, "torque_rate_limit": 500.0}, {}),
+    "rate": (FOUR, {"torque_rate_limit": 500.0}, {}),
     "rate, landing": ("heptagon", {"torque_rate_limit": 500.0}, {}),
     "rate, box": ("box_rolling", {"torque_rate_limit": 500.0}, {}),
-    "lag": ("heptagon_four_contacts", {"actuator_lag": 0.002}, {}),
-    "rate and lag": (
-        "heptagon_four_contacts", {"torque_rate_limit": 1000.0, "actuator_lag": 0.001}, {},
-    ),
-    "period": ("heptagon_four_contacts", {"control_period": 0.005}, {}),
+    "lag": (FOUR, {"actuator_lag": 0.002}, {}),
+    "rate and lag": (FOUR, {"torque_rate_limit": 1000.0, "actuator_lag": 0.001}, {}),
+    "period": (FOUR, {"control_period": 0.005}, {}),
     "period, landing": ("heptagon", {"control_period": 0.005}, {}),
-    "period, linear": (
-        "heptagon_four_contacts", {"control_period": 0.005, "control_hold": "linear"}, {},
-    ),
-    "ranges": ("heptagon_four_contacts", {"uncertainty": RANGES}, {"robust": 1.0}),
-    "ranges, widest": (
-        "heptagon_four_contacts", {"uncertainty": RANGES}, {"robust": 1.0, "largest": True},
-    ),
+    "period, linear": (FOUR, {"control_period": 0.005, "control_hold": "linear"}, {}),
+    "ranges": (FOUR, {"uncertainty": RANGES}, {"robust": 1.0}),
+    "ranges, widest": (FOUR, {"uncertainty": RANGES}, {"robust": 1.0, "largest": True}),
     "ranges, landing": ("heptagon", {"uncertainty": RANGES}, {"robust": 1.0}),
     "ranges, none": ("box_rolling", {"uncertainty": RANGES}, {"robust": 1.0}),
-    "speed": ("heptagon_four_contacts", {"speed_limit": 3.0}, {}),
-    "certified": ("heptagon_four_contacts", {}, {"certify": True}),
+    "speed": (FOUR, {"speed_limit": 3.0}, {}),
+    "certified": (FOUR, {}, {"certify": True}),
     "certified, landing": ("heptagon", {}, {"certify": True}),
     "certified, impacts": ("heptagon_impact", {}, {"certify": True}),
-    "accurate": ("heptagon_four_contacts", {}, {"accuracy": 1e-6}),
-    "weak": ("heptagon_four_contacts", {"torque_limit": 0.7}, {}),
-    "weak, rate": ("heptagon_four_contacts", {"torque_rate_limit": 5.0}, {}),
-    "rough": ("heptagon_four_contacts", {"friction": 0.5}, {}),
-    "pressed": ("heptagon_four_contacts", {"epsilon": 1.5}, {}),
+    "accurate": (FOUR, {}, {"accuracy": 1e-6}),
+    "weak": (FOUR, {"torque_limit": 0.7}, {}),
+    "weak, rate": (FOUR, {"torque_rate_limit": 5.0}, {}),
+    "rough": (FOUR, {"friction": 0.5}, {}),
+    "pressed": (FOUR, {"epsilon": 1.5}, {}),
     "weak, over time": ("square", {"torque_limit": 0.25}, {}),
     "rough, over time": ("triangle", {"friction": 0.5}, {}),
-}  # fmt: skip
+}
 """A problem, changes of it, and options of the planner."""
 TUNED = {
-    "heptagon_four_contacts": ("heptagon_tuned.csv", 0),
+    FOUR: ("heptagon_tuned.csv", 0),
     "heptagon": ("heptagon_landing_tuned.csv", 0),
     "hexagon": ("hexagon_tuned.csv", 1),
 }
@@ -383,9 +378,7 @@ def _report(folder: Path, name: str) -> Row:
         torques = str(folder / "torques" / TUNED[name][0])
         status = start(["report", str(folder / f"{name}.toml"), path, torques, "-o", str(page)])
         text = page.read_text(encoding="utf-8")
-    tables = [
-        table for table in re.findall(r"<table>.*?</table>", text) if "planning took" not in table
-    ]
+    tables = (t for t in re.findall(r"<table>.*?</table>", text) if "planning took" not in t)
     cells = re.findall(r"<td[^>]*>(.*?)</td>", "".join(tables))
     numbers = [float(cell) for cell in cells if re.fullmatch(r"[-+]?\d+\.\d+", cell)]
     return {"exit": status, "cells": len(cells), "numbers": numbers}
@@ -415,7 +408,7 @@ def _count(formations: Iterable[Iterable[object]]) -> list[Any]:
 def _list(folder: Path, number: int) -> Row:
     """Formations along a route: that of the documentation first, then those of legs."""
     if number == 0:
-        problem = _load(folder, "heptagon_four_contacts")
+        problem = _load(folder, FOUR)
         places = (0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)
         route = wholearm.list_formations(problem, *((x, np.radians(phi)) for x, phi in places))
         return {
@@ -492,7 +485,7 @@ def _try(place: Path, work: Callable[[], object]) -> Row:
 
 
 def _ask(folder: Path, name: str) -> Row:
-    problem = _load(folder, "heptagon_four_contacts")
+    problem = _load(folder, FOUR)
     row = _try(folder, lambda: wholearm.solve(problem, **OPTIONS[name]))
     return {key: mask(text) for key, text in row.items()}
 
@@ -519,13 +512,13 @@ FAMILIES: dict[str, tuple[Callable[..., Row], list[Case]]] = {
     "plan": (_plan, [*product(PROBLEMS, OBJECTIVES)]),
     "variant": (_vary, [*zip(VARIANTS)]),
     "goal": (_reach, [*zip(range(60))]),
-    "robustness": (_assess, [("heptagon_four_contacts",)]),
+    "robustness": (_assess, [(FOUR,)]),
     "scene": (_scene, [(k, OBJECTIVES[k % 3]) for k in range(60)]),
     "leg": (_leg, [(k, OBJECTIVES[k % 3]) for k in range(60)]),
     "free": (_simulate_free, [*zip(PROBLEMS)]),
     "torques": (_follow, [*product(TUNED, (1.0, 1.05, 0.9))]),
-    "compare": (_compare, [("heptagon_four_contacts",)]),
-    "report": (_report, [("heptagon_four_contacts",)]),
+    "compare": (_compare, [(FOUR,)]),
+    "report": (_report, [(FOUR,)]),
     "predict": (_predict, [*zip(PROBLEMS)]),
     "map": (_draw_map, [*zip(PROBLEMS)]),
     "counts": (lambda folder, name: count(_load(folder, name)), [*zip(PROBLEMS)]),
@@ -678,9 +671,8 @@ def _reduce(answer: Any) -> Any:
     """Verdict, value and contact modes of a plan, or its refusal; other answers as they are."""
     if not answer or not {"replay", "refused"} & answer.keys():
         return answer
-    entries = {
-        key: answer[key] for key in ("refused", "objective", "value", "modes") if key in answer
-    }
+    keys = ("refused", "objective", "value", "modes")
+    entries = {key: answer[key] for key in keys if key in answer}
     return entries | {"replay": {"ok": answer.get("replay", {}).get("ok", False)}}
 
 

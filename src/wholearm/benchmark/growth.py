@@ -56,9 +56,8 @@ class Growth(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Tables with the exponents."""
-        parts: list[str | Table] = [
-            "Processor time and rise of the peak memory, each in a process of its own."
-        ]
+        text = "Processor time and rise of the peak memory, each in a process of its own."
+        parts: list[str | Table] = [text]
         for grows, (works, sizes) in WORK.items():
             table = []
             for work, (field, (unit, _)) in product(works, FIELDS.items()):

@@ -269,9 +269,7 @@ def draw_leg(
         except InputError:
             continue
         # Ends are the planner's to choose: what a refusal says holds for all places.
-        open_ends = (
-            replace(phase, until=replace(phase.until, pins=())) for phase in problem.phases
-        )
+        open_ends = (replace(each, until=replace(each.until, pins=())) for each in problem.phases)
         problem = replace(problem, phases=tuple(open_ends))
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
             return problem, [(float(part.stop[0]), float(part.stop[1])) for part in route]

@@ -458,10 +458,8 @@ def _solve_at_rest(
     unit = np.eye(f + 2 * n_c + 3)
     move, press, grip = unit[:f], unit[f : f + n_c], unit[f + n_c : f + 2 * n_c]
     drive = scene.mass_diagonal[:, None] * N @ move * scales.acceleration * scales.length
-    for k, touch in enumerate(touches):
-        drive -= scales.force * (
-            np.outer(touch.normal, press[k]) + np.outer(touch.tangent, grip[k])
-        )
+    for k, t in enumerate(touches):
+        drive -= scales.force * (np.outer(t.normal, press[k]) + np.outer(t.tangent, grip[k]))
     drive[3:] += scene.dry[3:, None] * unit[f + 2 * n_c : -1]
     scale = scales.force * np.array([1.0, 1.0, scales.length])
     torque = drive[3:] / scene.torque_limit[:, None]

@@ -749,14 +749,13 @@ def robustness(options: argparse.Namespace) -> int:
             raise InputError("", "--vary", fault) from None
     ranges = problem.ranges | spread_widths(widths, "range of {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
+    trials = wholearm.Uncertainty(ranges, options.sample_rate or None, options.tolerance, *goal)
     study = wholearm.assess_robustness(
         problem,
         plan,
         samples=options.samples,
         seed=options.seed,
-        uncertainty=wholearm.Uncertainty(
-            ranges, options.sample_rate or None, options.tolerance, *goal
-        ),
+        uncertainty=trials,
         phase=options.phase,
         policy=policy,
         path=output,
@@ -773,9 +772,8 @@ def route(options: argparse.Namespace) -> int:
     require_output(options.output)
     answer = find_route(options, read_problem(options), options.alternatives)
     clear_progress()
-    print(
-        f"{json.dumps(answer.to_dict(), indent=2)}\n" if options.json else answer.to_text(), end=""
-    )
+    text = f"{json.dumps(answer.to_dict(), indent=2)}\n" if options.json else answer.to_text()
+    print(text, end="")
     if options.output is not None:
         _save_map(answer.problem, answer.plan.trajectory, options.output)
         print(f"wrote {options.output}", file=sys.stderr)
@@ -906,9 +904,8 @@ def replay(options: argparse.Namespace) -> int:
     if policy is None:
         arguments |= {"allowed": options.departure, "halvings": options.refine}
         with name_source(options.problem):
-            return finish(
-                options, wholearm.replay_in(options.engine, problem, plan, **arguments), notes=notes
-            )
+            replays = wholearm.replay_in(options.engine, problem, plan, **arguments)
+        return finish(options, replays, notes=notes)
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
     arguments["allowed"] = ALLOWED if options.departure is None else options.departure
@@ -947,9 +944,7 @@ def policy(options: argparse.Namespace) -> int:
             say(f"trying {words}")
             with suppress(WholearmError):
                 tried = plan if scene is problem else plan_anew(scene)
-                made = wholearm.make_policy(
-                    scene, tried, **{**values, **changes}, planner=plan_anew
-                )
+                made = wholearm.make_policy(scene, tried, **(values | changes), planner=plan_anew)
                 if wholearm.verify_policy(scene, tried, made, **allowed).ok:
                     return f"{words} would do"
         return f"{', '.join(words for words, *_ in trials)} would not do either"
@@ -1184,9 +1179,8 @@ def write_problem(options: argparse.Namespace) -> int:
             fault = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
             raise InputError("", "--vertices", fault) from None
     with name_source("--vertices" if vertices is not None else ""):
-        content = write_template(
-            Path(output).stem, options.polygon, options.size, options.mass, vertices
-        )
+        size = options.polygon, options.size, options.mass
+        content = write_template(Path(output).stem, *size, vertices)
     write_text(output, content)
     print(f"wrote {output}; next: wholearm solve {output}")
     return 0

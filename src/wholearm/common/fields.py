@@ -201,9 +201,7 @@ class Field:
 
     def explain(self) -> str:
         """The text, with range and default."""
-        allowed = [
-            field.describe() for field in (self.kind, *self.ranges) if isinstance(field, Range)
-        ]
+        allowed = [each.describe() for each in (self.kind, *self.ranges) if isinstance(each, Range)]
         default = f"default {self.describe_default()}" if self.describe_default() else ""
         more = "; ".join(filter(None, (*allowed, default)))
         return self.text + (more and f" ({more})")
@@ -253,7 +251,7 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
             default = defaults[attribute]
             keys[attribute] = field if default is MISSING else replace(field, default=default)
         lines = [
-            f"    {name}\n        {field.explain()}" for name, field in keys.items() if field.text
+            f"    {name}\n        {each.explain()}" for name, each in keys.items() if each.text
         ]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
         owner.__keys__ = keys  # type: ignore[attr-defined]

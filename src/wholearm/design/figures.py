@@ -171,9 +171,8 @@ def _draw_plane(
     mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
         levels = MaxNLocator(8).tick_values(low, high)
-        lines = axes.contour(
-            x, y, np.ma.masked_invalid(values), levels, colors="white", linewidths=0.9
-        )
+        shown_values = np.ma.masked_invalid(values)
+        lines = axes.contour(x, y, shown_values, levels, colors="white", linewidths=0.9)
         axes.clabel(lines, fontsize=7.5)
     shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():

@@ -121,9 +121,7 @@ class Aim:
     def set(self, hand: Hand) -> dict[str, float]:
         """Values by dotted keys."""
         pairs = zip(self.choices, self.find(hand), strict=True)
-        return {
-            k: factor * value for choice, value in pairs for k, factor in choice.factors.items()
-        }
+        return {key: f * value for one, value in pairs for key, f in one.factors.items()}
 
     def search(self, start: int, budget: int, report: Callable[[str], None]) -> list[Hand]:
         """The hands of one search."""

@@ -38,16 +38,13 @@ def draw_comparison(comparison: Comparison) -> Figure:
     """
     shown = [(contender, contender.replayed) for contender in comparison.contenders]
     motions = [motion for _, motion in shown if motion is not None]
-    styles = style.choose_styles(
-        tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
-    )
+    names = dict.fromkeys(name for motion in motions for name in motion.contacts)
+    styles = style.choose_styles(tuple(names))
     longest = max((motion.duration for motion in motions), default=1.0)
     # Height of a panel, and of a line of text above it, and room at both sides [in].
     tall, line, left, right = 2.45, 0.25, 0.8, 1.3
     high = 0.5 + len(motions) * (tall + line + 0.4) + len(shown) * line
-    covered = np.concatenate(
-        [[0.0], *(motion.c_n.ravel() - comparison.epsilon for motion in motions)]
-    )
+    covered = np.concatenate([[0.0], *(m.c_n.ravel() - comparison.epsilon for m in motions)])
     with style.open_figure(10.0, high) as figure:
         title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
         style.write_title(figure, title)
@@ -58,9 +55,8 @@ def draw_comparison(comparison: Comparison) -> Figure:
             high -= line
             what = f"{contender.duration:.4g} s" if contender.ok else contender.reason
             between = _DOT if contender.ok else ": "
-            figure.text(
-                left, high, f"{contender.name}{_DOT}{contender.verdict}{between}{what}", **look
-            )
+            heading = f"{contender.name}{_DOT}{contender.verdict}{between}{what}"
+            figure.text(left, high, heading, **look)
             if motion is None:
                 continue
             high -= tall + line
@@ -175,9 +171,7 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     deep = 1e3 * style.PALM * scene.scales.length
-    axes.add_patch(
-        Rectangle((left, -deep), right - left, deep, fc=style.INK, linewidth=0, zorder=1)
-    )
+    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=style.INK, lw=0, zorder=1))
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
 
@@ -203,9 +197,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
     high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    notes = [
-        f" (at least {least:g})" if min(column) <= least else "" for column in around.T.tolist()
-    ]
+    notes = [f" (at least {least:g})" * (min(column) <= least) for column in around.T.tolist()]
     axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))

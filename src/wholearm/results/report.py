@@ -338,10 +338,8 @@ class Report(Result):
         for loss in self.help.losses:
             if loss.kind == "thin":
                 continue
-            for load in loss.forces:
-                rows.append(
-                    (loss.time, f"c_n of {load.contact}", load.c_n, load.c_t, *load.per_tau)
-                )
+            for at in loss.forces:
+                rows.append((loss.time, f"c_n of {at.contact}", at.c_n, at.c_t, *at.per_tau))
             if loss.closing:
                 value, *per_tau = loss.closing
                 until = self.phases[loss.phase - 1].until

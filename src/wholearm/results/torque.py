@@ -80,9 +80,8 @@ class TorqueProfile:
         """The same torques from `start` to `stop` [s], those of the ends held beyond them."""
         near = 1e-12 * max(abs(start), abs(stop))
         inner = self.breaks[(self.breaks > start + near) & (self.breaks < stop - near)]
-        profile = TorqueProfile.fit(
-            np.array([start, *inner, stop]), self.at, self.coefficients.shape[2] - 1
-        )
+        breaks, degree = np.array([start, *inner, stop]), self.coefficients.shape[2] - 1
+        profile = TorqueProfile.fit(breaks, self.at, degree)
         # Whole pieces stay as they are to the last bit.
         first = np.searchsorted(self.breaks, profile.breaks[:-1])
         first = np.minimum(first, len(self.coefficients) - 1)
@@ -229,9 +228,8 @@ def place_rows(
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]
-    rows = np.concatenate(
-        [np.column_stack([stretch, _fit_lines(torque, stretch)]) for stretch in stretches]
-    )
+    parts = [np.column_stack([part, _fit_lines(torque, part)]) for part in stretches]
+    rows = np.concatenate(parts)
     # Lines through a bend miss it on both sides; no limit is to be missed for that.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)

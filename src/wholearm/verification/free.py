@@ -204,9 +204,8 @@ def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase
             break
         z = simulation.z[int(np.searchsorted(simulation.t, stop, side="right")) - 1]
         if phase.until.measure_pins(z, problem.scene.scales.length) > allowed:
-            failures.append(
-                f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
-            )
+            place = f"at {describe_pose(z)}, and not with {phase.until}"
+            failures.append(f"phase {phase.number} ends {place}")
         start = stop
     return tuple(phases), failures
 
@@ -364,9 +363,7 @@ class FreeReport(Result):
         """The verdict with its reason, then what happened."""
         whole, lines = self.whole, [f"failure: {text}" for text in self.failures[1:]]
         form = fixed(1e-3 * max((s.least for s in whole.stretches if s.least > 0), default=0.0))
-        events = [
-            (e.time, e.phase + 1, e.text.rpartition(" at t =")[0] or e.text) for e in whole.events
-        ]
+        events = [(e.time, e.phase + 1, e.text.partition(" at t =")[0]) for e in whole.events]
         columns = {"contact": "contact", "start": "presses from [s]:.6f", "stop": "to [s]:.6f"}
         columns |= {"least": f"least c_n [N]:{form}", "time": "at [s]:.6f"}
         told = "the whole from the start, by the clock" if self.alone else ""

@@ -172,9 +172,8 @@ def find_finger_gap(simulation: Simulation) -> results.FingerGap:
     times = np.append(t, t[left] + run)
     order = np.argsort(times, kind="stable")
     gaps = evaluate_finger_gap(scene, np.concatenate([z, inside]))
-    return results.FingerGap(
-        *find_lowest(times[order], gaps[order], 2 * SETTLING * scene.scales.time)
-    )
+    shortest = 2 * SETTLING * scene.scales.time
+    return results.FingerGap(*find_lowest(times[order], gaps[order], shortest))
 
 
 def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False) -> results.Report:
@@ -263,9 +262,7 @@ def _report_phase(
         until=until,
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
-        contacts=tuple(
-            results.ContactMargin(*least, least[1] - problem.epsilon) for least in pressing
-        ),
+        contacts=tuple(results.ContactMargin(*one, one[1] - problem.epsilon) for one in pressing),
         rolling=tuple(results.SlipMargin(*least) for least in slips),
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
@@ -393,10 +390,8 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
         amounts = short[:, limits.owners == k].max(axis=1)
         worst = int(amounts.argmax())
         if amounts[worst] > MISSED * limit.scale:
-            over = f"{amounts[worst]:.3g} {limit.unit}"
-            texts.append(
-                f"{limit.text} is exceeded by {over} at t = {t[worst]:.5g} s, phase {phase.number}"
-            )
+            text = f"{limit.text} is exceeded by {amounts[worst]:.3g} {limit.unit}"
+            texts.append(f"{text} at t = {t[worst]:.5g} s, phase {phase.number}")
     return texts
 
 
