@@ -250,9 +250,7 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
             attribute = field.attribute or field.name
             default = defaults[attribute]
             keys[attribute] = field if default is MISSING else replace(field, default=default)
-        lines = [
-            f"    {name}\n        {each.explain()}" for name, each in keys.items() if each.text
-        ]
+        lines = [f"    {k}\n        {one.explain()}" for k, one in keys.items() if one.text]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
         owner.__keys__ = keys  # type: ignore[attr-defined]
         return owner
