@@ -590,10 +590,6 @@ class Corpus(Study):
             if any(fnmatch(" ".join(map(str, case)), pattern) for pattern in options.only or "*"):
                 yield case
 
-    def list_inputs(self, options: argparse.Namespace) -> list[Path]:
-        """The problem files."""
-        return sorted(Path(options.problems).glob("*.toml"))
-
     def limit(self, case: Case) -> float:
         """Tuning takes a thousand simulations."""
         return 300.0 if case[0] == "tune" else 120.0

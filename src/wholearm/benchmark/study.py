@@ -49,7 +49,7 @@ class Study:
 
     name = title = ""  # of its files, ``bench_NAME.jsonl``, ``.md`` and ``.csv``; of the table
     folder = "results"  # where, if the command line does not say
-    of_code = False  # whether records count only for the source code and machine they are of
+    of_code = False  # whether records count only for the source, problems and machine they are of
     timed = alone = False  # whether cases are run one at a time, and each in a process of its own
     strict = False  # whether warnings are errors
     shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
@@ -77,10 +77,6 @@ class Study:
     def list_cases(self, options: argparse.Namespace) -> Iterable[Case]:
         """All cases."""
         raise NotImplementedError
-
-    def list_inputs(self, options: argparse.Namespace) -> Iterable[Path]:
-        """Files that records count for alone, beside the source code."""
-        return ()
 
     def run(self, case: Case) -> Row:
         """Run one case, in another process."""
@@ -113,17 +109,13 @@ def run_study(
     """
     cases = list(dict.fromkeys(study.list_cases(options)))
     make_folder(options.output)
-    stem, fresh = os.path.join(options.output, f"bench_{study.name}"), options.fresh
+    stem = os.path.join(options.output, f"bench_{study.name}")
     path, stamp = f"{stem}.jsonl", {"study": study.name, "version": __version__}
     stamp |= study.stamp(options)
     if study.of_code:
-        stamp["source"] = digest_source(study.list_inputs(options))
-        # Records of other code are no records; what is no study of this kind is left alone.
-        with suppress(OSError, ValueError, TypeError), open(path, encoding="utf-8") as stream:
-            header = dict(json.loads(stream.readline()))
-            same = header.get("source") == stamp["source"]
-            fresh = fresh or (header.get("study") == study.name and not same)
-    with Journal(path, stamp, fresh, options.again) as journal:
+        files = Path(options.problems).glob("*.toml") if study.shipped else ()
+        stamp["source"] = digest_source(sorted(files))
+    with Journal(path, stamp, options.fresh, options.again) as journal:
         done = {json.dumps(row["case"]): row for row in journal.records}
         left = [case for case in cases if json.dumps(case) not in done]
         wall_start, wrong = time.monotonic(), 0

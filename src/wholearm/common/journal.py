@@ -24,7 +24,7 @@ class Journal:
     have one of the same file. Only a regular file has records: `os.devnull` stands for none. The
     `stamp` is what the records belong to, its `study` their kind. A `fresh` file is begun anew,
     whatever it holds; with `again`, records with findings are dropped, so that their tasks are run
-    again.
+    again. Where the stamp has a `source` records of another one are none.
 
     InputError if the file holds something else, another study of the same kind included, or is
     being written by another run, or cannot be written.
@@ -76,10 +76,12 @@ class Journal:
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
         head = (json.dumps(self._stamp) + "\n").encode()
-        whole = head
+        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"]
+        if other.get("study") == kind and other.get("source") != self._stamp.get("source"):
+            given = b""
         # Half of the first line is what a full disk leaves.
         if not head.startswith(given):
-            other, kind, text = _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"], ""
+            text = ""
             if other.get("study") != kind:
                 text = f"no {kind} study"
             elif differences := list(find_differences(other, self._stamp)):
