@@ -839,7 +839,7 @@ class Precision(Study):
 
     name, title, timed = "precision", "Run time against error, with peers", True
     columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
-    packages, shipped = ("toppra", "yapss"), True
+    shipped = True
     allowed = 60.0
     options = """\
 --peers NAME ...  measure these methods only, by the names that the table has (all)

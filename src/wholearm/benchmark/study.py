@@ -41,7 +41,7 @@ Added are `case`, the `seconds` of processor time, and `memory`, by which it has
 its process [MB].
 """
 Findings = tuple[Sequence[str | Table], list[str]]
-PACKAGES = ("casadi", "numpy", "scipy")
+PACKAGES = ("casadi", "numpy", "scipy", "toppra", "yapss")  # those that are there are stated
 
 
 class Study:
@@ -54,7 +54,6 @@ class Study:
     strict = False  # whether warnings are errors
     shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
-    packages: tuple[str, ...] = ()  # further ones whose versions are stated
     options = ""  # table of options beside those that every study has, as of `read_options`
 
     def list_options(self) -> str:
@@ -137,7 +136,7 @@ def run_study(
     parts, violations = study.report(good, options)
     findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row]
     findings += violations
-    parts = [describe_machine(study.packages), *parts]
+    parts = [describe_machine(), *parts]
     if findings:
         parts += ["## Findings", "\n".join(f"* {text}" for text in findings)]
     text = Document(study.title, parts=parts).to_markdown()
@@ -156,14 +155,12 @@ def run_study(
     return text, findings, written
 
 
-def describe_machine(packages: Sequence[str] = ()) -> str:
+def describe_machine() -> str:
     """Versions, processor and cores, in a line."""
     parts = [f"wholearm {__version__}", f"Python {platform.python_version()}"]
-    for name in (*PACKAGES, *packages):
-        try:
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
             parts.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
         match = re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.M)
