@@ -32,7 +32,8 @@ def play(
     """Replay a stretch in Drake; an `Engine`."""
     steps, drive = engine.list_steps(problem, stretch, torque, setting.step), None
     if isinstance(torque, ClosedLoop):
-        drive = engine.EngineDrive(problem.scene, torque, _EVERY * steps.h)
+        step = _EVERY * steps.h
+        drive = engine.EngineDrive(problem.scene, torque, stretch.duration, step)
     setting = setting._replace(step=steps.h / problem.scene.scales.time)
     # Half spaces touch nothing deformable, which would be a warning.
     log = logging.getLogger("drake")

@@ -20,7 +20,6 @@ both edges at one place. The links press each other without friction.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -37,6 +36,7 @@ from ..problem.read import read_own_problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
+from ..simulation.run import Feedback
 from ..simulation.simulate import simulate
 
 OBJECT = "object"
@@ -251,7 +251,7 @@ def record(
         press.append(advance(start, end))
         states.append(read())
         start = end
-        if drive is not None and drive.over:
+        if drive is not None and drive.loop.over:
             break
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
@@ -331,28 +331,21 @@ def _list_independent(rows: Array, kept: int) -> list[int]:
 class EngineDrive:
     """Torques of a policy in an engine, sampled, delayed, and less regularized dry friction.
 
-    Two calls are `h` [s] apart; `over` says whether the motion is over.
+    It lasts for a `duration`, and two calls are `h` apart [s].
     """
 
-    def __init__(self, scene: Scene, loop: ClosedLoop, h: float) -> None:
-        self.loop, self.h = loop, h
-        self.dry = scene.dry[3:]
+    def __init__(self, scene: Scene, loop: ClosedLoop, duration: float, h: float) -> None:
+        self.loop, self.h, self.dry = loop, h, scene.dry[3:]
+        self.feedback, self.begun = Feedback(loop, duration), 0  # and its pieces so far
         inertia = np.array([finger.inertia for finger in scene.fingers])
         # Regularization speed of dry friction: ten times what it changes in a step.
         self.creep = np.maximum(10.0 * self.dry * h / inertia, np.finfo(float).tiny)
-        self.samples, self.tau = 0, np.zeros(2)
-        self.coming: deque[tuple[float, Array]] = deque()
-        self.over = False
 
     def step(self, t: float, theta: Array, theta_dot: Array) -> Array:
         """Applied torques at a time, shape (2,) [N m]; times increase from zero."""
-        t += 0.5 * self.h
-        if t >= self.samples * self.loop.period:
-            at = self.samples * self.loop.period
-            tau = np.array(self.loop.held(at, theta, theta_dot, {}))
-            self.coming.append((at + self.loop.delay if self.samples else 0.0, tau))
-            self.samples += 1
-            self.over = self.loop.over
-        while self.coming and t >= self.coming[0][0]:
-            self.tau = self.coming.popleft()[1]
-        return np.asarray(self.tau - self.dry * np.clip(theta_dot / self.creep, -1.0, 1.0))
+        torque = self.feedback.torque
+        while t + 0.5 * self.h >= torque.breaks[self.begun] and self.begun < len(torque.breaks) - 1:
+            self.feedback.begin(self.begun, theta, theta_dot, {})
+            self.begun += 1
+        tau = torque.coefficients[self.begun - 1, :, 0]
+        return np.asarray(tau - self.dry * np.clip(theta_dot / self.creep, -1.0, 1.0))

@@ -223,7 +223,7 @@ def play(
     steps = engine.list_steps(problem, stretch, torque, setting.step)
     drive = None
     if isinstance(torque, ClosedLoop):
-        drive = engine.EngineDrive(problem.scene, torque, steps.h)
+        drive = engine.EngineDrive(problem.scene, torque, stretch.duration, steps.h)
     text = write_mjcf(problem, step=steps.h, softness=setting.softness)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
