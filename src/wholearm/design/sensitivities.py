@@ -26,10 +26,9 @@ from ..common.document import Document, Result, Table, fixed
 from ..common.errors import SolverError, WholearmError
 from ..common.parallel import count_cores, share
 from ..common.sharing import exclusive
-from ..contacts.formation import Formation
 from ..geometry.curve import Curve, tangent_basis
 from ..geometry.tracing import trace_phase, trace_phases
-from ..mechanics.dynamics import metric_weights, move_least
+from ..mechanics.dynamics import metric_weights
 from ..mechanics.limits import LimitSet
 from ..planning.blocks import BlockPlan, Planning, make_sequence, plan_blocks
 from ..planning.options import Objective, PlanOptions
@@ -41,6 +40,7 @@ from ..planning.time_domain.guesses import list_stages
 from ..problem.definition import End, Problem
 from ..problem.read import require_phases
 from ..search import solve as solve_any
+from ..simulation.modes import close_contacts
 from .parameters import Parameter, find_parameter, list_parameters
 from .sweep import name_limit
 
@@ -254,7 +254,7 @@ def find_lagrangian(planning: Planning) -> Evaluate:
     def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
         terms: Terms = []
         for index, evaluate_block in reversed(made):
-            z = _close(problem.phases[index].formation, z)
+            z = close_contacts(problem.phases[index].formation, z)
             more, z = evaluate_block(problem, z)
             terms += more
         return terms, z
@@ -275,14 +275,6 @@ def find_lagrangian(planning: Planning) -> Evaluate:
                 price += (high - low) / (2 * h) * u * roots
         made.append((block.phases[0].index, use_time(planning, block, price)))
     return evaluate
-
-
-def _close(formation: Formation, z: Array) -> Array:
-    """The nearest configuration with closed contacts to one nearby, shape (5,)."""
-    for _ in range(5):
-        here = formation.evaluate(z[None], np.zeros((1, 5)))
-        z = z + move_least(here.A, -here.C, metric_weights(formation.scene))[0]
-    return z
 
 
 @exclusive
