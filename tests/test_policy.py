@@ -242,6 +242,19 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
     assert [phase.number for phase in report.phases] == [1, 2, 3, 4]
     end = report.phases[-1].deviation
     assert end is not None and end.position < 5e-5 and end.angle < np.radians(0.05)
+    # Torques of one side of a border are held up to half a period beyond it: they press there, too.
+    law = policy.laws[1]
+    assert isinstance(law, CurveLaw)
+    for phase, k in zip(problem.phases[2:], law.borders, strict=True):
+        row, speed = np.flatnonzero(plan.phase == phase.index)[0], float(np.sqrt(law.b[k]))
+        z, chord = plan.z[row], np.array(law.chords[k]) / law.steps[k]
+        v = plan.z_dot[row] * speed * np.linalg.norm(chord) / np.linalg.norm(plan.z_dot[row, 3:])
+        a = (law.b[k] - law.b[k - 1]) / (2 * law.steps[k - 1])
+        internal = choose_internal_force(*law._list_levels(k - 1, 1.0, speed), a)[1]
+        tau = np.array(law._list_torques(k - 1, 1.0, speed)) @ [1.0, a, internal]
+        signs = np.sign(phase.formation.evaluate(z[None], v[None]).A_t[0] @ v), np.sign(v[3:])
+        c = build_forward(phase.formation)(z, v, tau, *signs)[1].full()
+        assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone
 
 
 def test_a_contact_may_be_open_for_a_moment_where_a_phase_begins(problem: Problem) -> None:

@@ -109,6 +109,26 @@ class CurveLimitRows(NamedTuple):
         return np.asarray(self.slack / self.unit[..., None])
 
 
+def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
+    """Rows with the contact limits at the start of the curve `after`, under the last torques.
+
+    Torques are held for a period. Where the contact passes from an edge to a vertex of a small
+    radius, those of the old curve lose it. Case: query 9, phase 5.
+    """
+    formation, point, torque = after.formation, after.evaluate(np.zeros(1)), rows.torque[-1:]
+    directions = directions_of(after, np.zeros(1, dtype=np.int64))
+    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    limits, size = split_limits(formation)[0], len(rows.s)
+    slack = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
+    beyond = np.tile(UNLIMITED, (size, slack.shape[1], 1))
+    beyond[-1] = slack[0]
+    unit = np.tile(SETTINGS.least * limits.scales[limits.sides[0]], (size, 1))
+    return rows._replace(
+        slack=np.concatenate([rows.slack, beyond], axis=1),
+        unit=np.concatenate([rows.unit, unit], axis=1),
+    )
+
+
 def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
     """Limits with an epsilon of zero: those of contact forces, and those of torques alone.
 
@@ -428,12 +448,19 @@ def _trace(
         within, share = retime_within(curve, s, planned, widths, problem.epsilon, end)
         if within is not None:
             return ReferencePiece(curve, *within, share, begins, passes, b)
+
+    beyond = None if after is None or not passes or phase.end is not End.SMOOTH else after.curve
+
+    def find_rows(motion: PathMotion) -> CurveLimitRows:
+        rows = make_rows(curve, s, motion)
+        return rows if beyond is None else add_limits_beyond(rows, beyond)
+
     best: tuple[CurveLimitRows, ControllableSet, float] | None = None
     for factor in SETTINGS.slower:
         motion = factor * a, factor * b
-        rows = make_rows(curve, s, (*motion, internal))
+        rows = find_rows((*motion, internal))
         for _ in range(2 if factor < 1.0 else 0):
-            rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
+            rows = find_rows((*motion, find_internal_force(rows, *motion)))
         wanted = size * rows.unit
         wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
         controllable_set = retime(s, rows.slack, wanted, motion[1], end)
@@ -584,10 +611,15 @@ def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array
     """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
     length = one["s"][-1]
     joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("theta", "b")}
-    for name in ("levels", "torque", "forces"):
-        joined[name] = np.concatenate([one[name], two[name]])
     joined["s"] = np.concatenate([one["s"], length + two["s"][1:]])
     joined["starts"] = np.concatenate([one["starts"], length + two["starts"]])
+    for name in ("torque", "forces"):
+        joined[name] = np.concatenate([one[name], two[name]])
+    parts = one["levels"], two["levels"]
+    levels = np.tile(UNLIMITED, (len(joined["s"]) - 1, 2, max(p.shape[2] for p in parts), 1))
+    for part, span in zip(parts, (slice(len(parts[0])), slice(len(parts[0]), None)), strict=True):
+        levels[span, :, : part.shape[2]] = part
+    joined["levels"] = levels
     return {**two, **joined}
 
 
