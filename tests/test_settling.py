@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,17 @@ from rows import each
 from shipped import HEPTAGON, part_of, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.mechanics.statics import Statics
 from wholearm.planning import dwell
+from wholearm.planning.blocks import Planning, plan_block, plan_free
 from wholearm.planning.dwell import list_touching, settle_plans
+from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan, Settled
 from wholearm.planning.replay_check import make_table
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
-from wholearm.problem.read import read_own_problem
+from wholearm.problem.read import build_problem, read_own_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
@@ -414,6 +419,70 @@ def test_torques_are_held_from_period_to_period(hold: str, tmp_path: Path) -> No
     assert known.phases[0].unheld == free
     scene = read_own_problem(known.trajectory.meta, path).scene
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
+
+
+TURNED = np.array([-0.05469906, 0.0494152, -2.18382371, 2.38529929, 2.03754111])
+"""Start of the last phase of the turn, on three contacts."""
+TURN = (
+    {
+        "contacts": ["v3-palm", "v5-finger1", "v1-finger2"],
+        "until": {"contact": "v6-finger1", "x": -0.05466183792},
+    },
+    {"contacts": ["v3-palm", "v5-finger1", "v6-finger1", "v1-finger2"], "until": "v2-finger2"},
+    {
+        "contacts": ["v3-palm", "v6-finger1", "v1-finger2"],
+        "until": {"contact": "v4-palm", "x": 0.00791478646},
+    },
+)
+
+
+def turn(changes: dict[str, Any]) -> tuple[Problem, Formation, Array]:
+    """A turn of the heptagon with its last phase's formation and start."""
+    table = {**problem_of(HEPTAGON).table, "start": {"flush": 2, "x": -0.0597}, "phases": [*TURN]}
+    problem = build_problem(table).with_(changes)
+    formation = problem.phases[-1].formation
+    return problem, formation, close_contacts(formation, TURNED)
+
+
+def test_continuous_torques_begin_on_the_verge_of_a_mode() -> None:
+    """The modes that statics list press by a balance of their own, with friction of sliding."""
+    problem, own, z = turn({})
+    epsilon = problem.epsilon
+    scene, kinematics = problem.scene, own.evaluate(z[None], np.zeros((1, 5)))
+    A, A_t = kinematics.A[0], kinematics.A_t[0]
+    listed = Statics(own, z).list_continuous(epsilon)
+    assert listed is not None
+    modes = {signs for _, signs in listed}
+    pressed = dict[tuple[float, ...], bool]()
+    for signs in product((-1.0, 1.0), repeat=5):
+        Xi, sigma = np.split(np.array(signs), [3])
+        push = A - (own.friction * Xi)[:, None] * A_t
+        load = -scene.applied_force + scene.dry * np.append(np.zeros(3), sigma)
+        x = np.linalg.solve(np.vstack([push, np.eye(5)[3:]]).T, load)
+        pressed[signs] = bool(
+            (x[:3] >= epsilon).all() and (np.abs(x[3:]) < scene.torque_limit).all()
+        )
+    assert all(pressed[signs] for signs in modes if all(signs))
+    # The turn by itself cannot begin so; while its first contact with finger 2 rolls it can.
+    fast = (1.0, -1.0, -1.0, -1.0, -1.0)
+    assert not pressed[fast] and (1.0, -1.0, 0.0, -1.0, -1.0) in modes
+
+
+def test_a_turn_begins_and_ends_in_other_modes_under_rate_limits() -> None:
+    rate, options = 500.0, PlanOptions(accuracy=1e-2, mode_search=False)
+    problem, formation, z = turn({"torque_rate_limit": rate})
+    planning = Planning(problem, (), options, ())
+    (free,) = plan_free(planning, problem.phases[2:], z, options)
+    ((plan,), _) = plan_block(planning, problem.phases[2:], z, options)
+    assert free.value < plan.value < 1.05 * free.value
+    torque, t = plan.torque, np.linspace(0.0, plan.motion.duration, 2001)
+    steps = np.abs(np.diff(torque.at(t), axis=0)) / np.diff(t)[:, None]
+    assert steps.max() < rate * (1 + 1e-3)
+    ends, landed = plan.motion.evaluate(t[[0, -1]]).z, parse_contact("v4-palm", problem.scene)
+    for touching, place, tau in zip(
+        (formation, formation.add(landed)), ends, plan.end_torques, strict=True
+    ):
+        assert Statics(touching, place).torque_polygon().measure(tau[None])[0] < 1e-6
 
 
 def test_torques_that_are_held_cannot_be_limited_in_their_rate() -> None:

@@ -152,17 +152,14 @@ class Statics:
         answer = self._solve(tau, np.zeros((5, 1)), free, -np.ones(1), presses=True)
         return np.full((2, len(self.A)), np.nan) if answer is None else np.array(answer[:2])
 
-    def find_block(
-        self, epsilon: float, ends: bool = False, within: TorquePolygon | None = None
-    ) -> BlockedStart | None:
+    def find_block(self, epsilon: float, ends: bool = False) -> BlockedStart | None:
         """Why no motion begins from rest, or `ends` at rest; None if one may.
 
-        By torques `within` a polygon, if there is one. Formations with more than two degrees of
-        freedom always may.
+        Formations with more than two degrees of freedom always may.
         """
         best, modes = None, list(self._list_modes(ends))
         for mode in modes:
-            answer = self._start(mode, epsilon, within=within)
+            answer = self._start(mode, epsilon)
             if answer is not None and answer.x[-1] >= 0:
                 return None
             if answer is not None and (best is None or answer.x[-1] > best.x[-1]):
@@ -172,6 +169,29 @@ class Statics:
         # Contacts that lack equally much: the first, not the one that rounding chooses.
         equal = best.c_n <= best.c_n.min() + _TINY * self.scene.scales.force
         return BlockedStart(self.formation.names[int(equal.argmax())], -float(best.x[-1]))
+
+    def list_continuous(
+        self, epsilon: float, held: TorquePolygon | None = None
+    ) -> list[tuple[float, tuple[float, ...]]] | None:
+        """Modes in which a motion begins by continuous torques, or ends by torques that are `held`.
+
+        Without acceleration at first, it begins on the verge: friction is that of the mode. It may
+        end with an acceleration. Each has its margin of c_n over epsilon [N], and signs of sliding
+        and turning, (n_c + 2,). None with more than two degrees of freedom.
+        """
+        possible, modes = (
+            list[tuple[float, tuple[float, ...]]](),
+            list(self._list_modes(held is not None)),
+        )
+        for mode in modes:
+            still = _Mode(mode.N[:, :0], mode.rates[:, :0], mode.opens[:0, :0], mode.signs)
+            each = [self._start(mode, epsilon, within=held)]
+            if held is None and each[0] is not None:
+                each.append(self._start(still, epsilon))
+            margins = [-np.inf if answer is None else float(answer.x[-1]) for answer in each]
+            if min(margins) >= 0:
+                possible.append((min(margins), tuple(mode.signs.tolist())))
+        return possible if modes else None
 
     def find_epsilon(self, ends: bool = False) -> float | None:
         """The largest epsilon with which a motion can begin, or end here [N], or None."""

@@ -503,6 +503,7 @@ def require_hold_at_ends(
         touching = stage.ending if node else own
         z, limit = stage.guess.nodes[node, 0], problem.scene.torque_limit
         held = Statics(make_formation(own.scene, touching.contacts), z).torque_polygon()
+        moving = Statics(phase.formation, z)
         text = f"phase {phase.number} is infeasible: {may_not}"
         where = f"{'end' if node else 'start'}, {describe_pose(z)}"
         names, advice = " ".join(touching.names), "or leave out torque_rate_limit and actuator_lag"
@@ -513,7 +514,13 @@ def require_hold_at_ends(
                 f"with their friction can be held there by no torques, {most}; end the phase where "
                 f"they can (wholearm predict shows where), {advice}"
             )
-        if touching is not own and Statics(own, z).find_block(problem.epsilon, True, held):
+        if node == 0 and moving.list_continuous(problem.epsilon) == []:
+            raise InfeasibleError(
+                f"{text}, and no motion begins without a step at its {where}: c_n >= "
+                f"{problem.epsilon:g} N on {names} and the torque limits exclude balance on the "
+                "verge of all; leave out torque_rate_limit and actuator_lag"
+            )
+        if touching is not own and moving.list_continuous(problem.epsilon, held) == []:
             raise InfeasibleError(
                 f"{text}, and none that bring it to rest at its {where}, and keep c_n >= "
                 f"{problem.epsilon:g} N until then, hold the object there on {names}; end it "

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from operator import ne
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +19,10 @@ from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
 from ...mechanics.dynamics import Directions, split_forces
+from ...mechanics.statics import Statics
 from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, make_formation, resample
-from .time_nlp import least_senses, new_rows
+from .time_nlp import least_senses, new_rows, stops
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage
 WORTH = 1e-4  # least relative gain of a move; dropping a vanished stage may cost as much
@@ -66,7 +68,7 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         turns, growing, gained = tuple[int, ...](), tuple[int, ...](), None
         fading = tuple[tuple[int, float], ...]()
-        if linked and not linked[-1].ends_in_impact:
+        if linked and not (linked[-1].ends_in_impact or linked[-1].rests):
             contacts = linked[-1].formation.contacts
             growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in contacts)
         if coming is not None and not stage.ends_in_impact:
@@ -77,7 +79,10 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
             fading = find_passing(stage, coming)
             fresh = new_rows(stage.formation, coming.formation)
             gained = coming.formation if fresh else None
-        linked.append(replace(stage, gained=gained, growing=growing, fading=fading, turns=turns))
+        stage = replace(stage, gained=gained, growing=growing, fading=fading, turns=turns)
+        if rests := coming is None or (coming.phase != stage.phase and stops(stage)):
+            fading = ()  # other torques begin after a pause
+        linked.append(replace(stage, rests=rests, fading=fading))
     return linked
 
 
@@ -94,6 +99,62 @@ def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
             row = coming.formation.contacts.index(contact)
             passing.append((k, float(coming.directions.Xi[row])))
     return tuple(passing)
+
+
+def drop_stops(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages without short ones at whose end the motion stops within a phase.
+
+    Torques that may not step do not pause there, and those held over periods only for whole ones:
+    phase 9 of query 28 starts with a stage of 0.1 ms.
+    """
+    left, fastest = list(stages), max(np.abs(stage.guess.nodes[:, 1]).max() for stage in stages)
+    for k in reversed(range(len(stages) - 1)):
+        stage, coming = left[k : k + 2]
+        still = np.abs(stage.guess.nodes[-1, 1]).max() < 1e-3 * fastest
+        if still and stage.phase == coming.phase:
+            shorter = k + (stage.guess.duration > coming.guess.duration)
+            left = drop(left, shorter) or left
+    return link(merge(left))
+
+
+def adapt_ends(stages: Sequence[Stage], search: TimeSearch) -> list[Stage]:
+    """Stages that begin from rest, and come to rest, in modes that continuous torques allow.
+
+    Where statics exclude a mode, the first or last interval gets the nearest one that is possible:
+    phase 3 of query 18 begins with a contact that rolls, and ends with one that slides back.
+    """
+    begins, adapted = True, list[Stage]()
+    for stage in stages:
+        pieces = [stage]
+        if begins and (mode := _find_nearest(stage, search, 0)):
+            pieces = split(stage, search.scheme, 0, 1, mode)
+        last = pieces[-1]
+        if last.rests and (mode := _find_nearest(last, search, -1)):
+            pieces[-1:] = split(last, search.scheme, last.intervals - 1, last.intervals, mode)
+        adapted += pieces
+        begins = stage.rests
+    return link(merge(adapted))
+
+
+def _find_nearest(stage: Stage, search: TimeSearch, node: int) -> Mode | None:
+    """Another mode for the start (`node` 0) or end (-1) of a stage, nearest to its own.
+
+    None if it may keep that, with one degree of freedom, or without a mode that is possible.
+    """
+    own, epsilon = search.problem.phases[stage.phase].formation, search.problem.epsilon
+    z, held, mode = stage.guess.nodes[node, 0], None, mode_of(stage)
+    if own.n_constraints >= 4:
+        return None
+    if node:
+        touching = make_formation(own.scene, stage.ending.contacts)
+        held = Statics(touching, z).torque_polygon(epsilon)
+    # A joint that rests is no mode of a stage.
+    listed = [
+        pair for pair in Statics(own, z).list_continuous(epsilon, held) or () if all(pair[1][-2:])
+    ]
+    differing = [(sum(map(ne, signs, mode)), -margin, signs) for margin, signs in listed]
+    count, _, nearest = min(differing, default=(0, 0.0, mode))
+    return nearest if count else None
 
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:

@@ -319,7 +319,8 @@ class TimeIterate:
     raised: list[LimitMisses]  # limits of the stages, by these amounts
     highest: float  # cost above which refinement ends
     is_solved: bool = True
-    coarse: float = math.nan  # cost of the solution before
+    change: float = 0.01  # of the cost by the last finer intervals, relative; at first a guess
+    least: float = math.nan  # cost of the first solution on these intervals
     refined: int = 0  # iterates with finer intervals so far
     before: TimeIterate | None = None  # the last one with a solution
 
@@ -333,14 +334,14 @@ class TimeIterate:
             raise SolverError(solution.status)
         if solution.cost > self.highest:
             raise CostlyError(COSTLY)
-        return replace(
-            self,
-            solution=solution,
-            stages=solution.stages,
-            is_solved=True,
-            coarse=self.solution.cost,
-            before=None,
-        )
+        change, least, old = self.change, self.least, self.solution
+        if [s.intervals for s in old.stages] != [s.intervals for s in self.stages]:
+            # What raised limits cost later is no reason for more intervals: phases 2 and 3 of query
+            # 12 would have twice as many.
+            change = abs(solution.cost - old.cost) / self.search.measure(solution.cost)
+            least = solution.cost
+        solved = replace(self, solution=solution, stages=solution.stages, change=change)
+        return replace(solved, least=least, is_solved=True, before=None)
 
     def adapt(self) -> TimeIterate | None:
         """With finer intervals, raised limits and those of the formation that are violated."""
@@ -408,7 +409,7 @@ class TimeIterate:
     @cached_property
     def gains(self) -> list[Array]:
         """Relative gain of torques of any shape in each interval of each stage."""
-        return _find_gains(self.search, self.solution, self.motions, self.coarse)
+        return _find_gains(self.search, self.solution, self.motions, self.change)
 
     @cached_property
     def halvings(self) -> list[NDArray[np.int64]]:
@@ -433,8 +434,15 @@ class TimeIterate:
 
     @property
     def error(self) -> float:
-        """Estimated relative gain of better torques; infinite on intervals that are too long."""
-        return math.inf if self.is_coarse else _sum(self.gains)
+        """Estimated relative gain of better torques; infinite on intervals that are too long.
+
+        That of rate-limited ones includes what limits between points have cost on these intervals.
+        """
+        if self.is_coarse:
+            return math.inf
+        slow, solution = self.search.problem.scene.has_slow_motors, self.solution
+        raised = abs(solution.cost - self.least) if slow and math.isfinite(self.least) else 0.0
+        return _sum(self.gains) + raised / self.search.measure(solution.cost)
 
 
 def refine_stages(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
@@ -446,7 +454,7 @@ def refine_stages(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         best = refine(first, solves=SETTINGS.iterates)
     except SolverError as error:
         return solution._replace(status=str(error), success=False)
-    return best.solution._replace(error=_sum(best.gains))
+    return best.solution._replace(error=best.error)
 
 
 def keep_within(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
@@ -563,12 +571,12 @@ def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Arr
 
 
 def _find_gains(
-    search: TimeSearch, solution: TimeSolution, motions: Sequence[StageMotion], coarse: float
+    search: TimeSearch, solution: TimeSolution, motions: Sequence[StageMotion], change: float
 ) -> list[Array]:
     """Relative gain of torques of any shape in each interval, shape (K,) each.
 
-    Zero for held torques. For rate-limited ones it is the gain of the last iterate, from the cost
-    `coarse`, distributed by the second differences of the control points.
+    Zero for held torques. For rate-limited ones it is the relative `change` of the cost by the last
+    finer intervals, distributed by the second differences of the control points.
     """
     stages, epsilon = solution.stages, search.problem.epsilon
     if stages[0].periods:
@@ -579,8 +587,7 @@ def _find_gains(
         for part in (stage.guess for stage in stages):
             bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
             shares.append(part.duration * part.fractions * bends)
-        gain = 0.01 if math.isnan(coarse) else abs(coarse - solution.cost) / size
-        return [share * (gain / max(_sum(shares), 1e-300)) for share in shares]
+        return [share * (change / max(_sum(shares), 1e-300)) for share in shares]
     square, gains = float(search.goal is Objective.EFFORT), list[Array]()
     x, weights = np.polynomial.legendre.leggauss(7)
     x = (x + 1) / 2

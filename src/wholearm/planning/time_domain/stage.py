@@ -131,6 +131,7 @@ class Stage:
     fading: tuple[tuple[int, float], ...] = ()
     growing: tuple[int, ...] = ()  # contacts that the stage before does not have
     ends_in_impact: bool = False
+    rests: bool = False  # whether everything stops at its end, before another phase or after all
     lands: bool = False  # whether the end has to be within the range of the contact gained there
     monitored: tuple[int, ...] = ()  # limits of the formation that are constraints at the points
     released: tuple[int, ...] = ()  # limits of the contacts released where the phase began

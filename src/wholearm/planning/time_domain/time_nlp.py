@@ -101,7 +101,7 @@ def lay_out(
     target: Target,
     held: bool = False,
 ) -> list[StageLayout]:
-    """Indices of the unknowns of successive stages; `held`: torques hold both ends."""
+    """Indices of the unknowns of successive stages; `held`: torques hold what rests."""
     layouts: list[StageLayout] = []
     stop, d, with_margin = 0, scheme.degree, int(target.chained)
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
@@ -112,7 +112,8 @@ def lay_out(
         end = 0 if scheme.ends else STATE
         sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
         interval = Columns(**sizes, end=end, short=short, m=with_margin)
-        begin = stop + np.arange((2 * stage.formation.n_contacts + 2) * (held and not layouts))
+        begins = held and (stage is stages[0] or stages[len(layouts) - 1].rests)
+        begin = stop + np.arange((2 * stage.formation.n_contacts + 2) * begins)
         first = stop + len(begin) + np.arange(STATE + with_margin)
         starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
         columns = {
@@ -136,7 +137,7 @@ def lay_out(
                 short=columns["short"],
                 impulses=stop + np.arange(extra),
                 begin=begin,
-                finish=stop + np.arange(rest * (held and coming is None)),
+                finish=stop + np.arange(rest * (held and stage.rests)),
             )
         )
         stop += extra + len(layouts[-1].finish)
@@ -361,7 +362,7 @@ def add_stage(
         there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
         rows.add_entries(there[:, None], end[Z], N.T)
     turns, gained_softly = _list_free_turns(stage), stage.gained
-    if _stops(stage):
+    if stops(stage):
         turns, gained_softly = (), None
         N = tangent_basis(formation, guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], end[V], N.T)
@@ -391,7 +392,7 @@ def _list_free_turns(stage: Stage) -> tuple[int, ...]:
     return tuple(free)
 
 
-def _stops(stage: Stage) -> bool:
+def stops(stage: Stage) -> bool:
     """Whether everything stops at the end of a stage, as independent rates reverse there.
 
     With one degree of freedom these are two, as one alone may have a zero.
@@ -417,7 +418,7 @@ def least_senses(stage: Stage, places: Array) -> Array:
 
 def find_still(stage: Stage, last: bool) -> set[int]:
     """Rows of (contacts, joints) that stand still at the end of a stage."""
-    if last or _stops(stage):
+    if last or stops(stage):
         return set(range(stage.formation.n_contacts + 2))
     coming = stage.gained.rolling if stage.gained else ()
     rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
@@ -433,7 +434,7 @@ def join_stages(
     """Continuous position and velocity from one stage to the next, or an impact."""
     (stage, coming), layout = pair, layouts[0]
     last, first = layout.nodes[-1], layouts[1].nodes[0]
-    if stage.formation.scene.has_slow_motors:
+    if stage.formation.scene.has_slow_motors and not stage.rests:
         join_motors(rows, stage, layouts, scheme)
     same = np.delete(np.arange(len(first)), V) if stage.ends_in_impact else slice(None)
     rows.add_equal(first[same], last[same])
@@ -562,18 +563,20 @@ def join_motors(
 def hold_ends(
     rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout], epsilon: float
 ) -> None:
-    """Torques hold the object at rest at both ends of a motion.
+    """Torques hold the object at rest at the ends of a motion, and where it stops between phases.
 
     It begins without acceleration, on the verge of its directions: friction may not step. So it
     ends with one degree of freedom, as along its curve. With more it may stop with an acceleration,
     which the contact that is gained and friction at rest take up.
     """
-    first, layout = stages[0], layouts[0]
-    last, final = stages[-1], layouts[-1]
-    for stage, formation, z, forces, tau in (
-        (first, first.formation, layout.nodes[0, Z], layout.begin, layout.tau[0, :2]),
-        (last, last.ending, final.nodes[-1, Z], final.finish, final.tau[-1, -2:]),
-    ):
+    ends = list[tuple[Stage, Formation, Indices, Indices, Indices]]()
+    for stage, layout in zip(stages, layouts, strict=True):
+        tau, z = layout.tau[[0, -1]], layout.nodes[[0, -1], Z]
+        if len(layout.begin):
+            ends.append((stage, stage.formation, z[0], layout.begin, tau[0, :2]))
+        if len(layout.finish):
+            ends.append((stage, stage.ending, z[1], layout.finish, tau[1, -2:]))
+    for stage, formation, z, forces, tau in ends:
         n_c, scene = formation.n_contacts, formation.scene
         signs = np.zeros(n_c + 2)
         if formation is stage.formation:
@@ -593,14 +596,15 @@ def hold_ends(
                 rows.add_entries(cone, c_t[k], np.array([1.0, -1.0]))
         low, high = (scene.dry[3:] * np.where(signs[n_c:], signs[n_c:], side) for side in (-1, 1))
         rows.add_entries(rows.linear(2, low=low, high=high), friction, 1.0)
-    if first.phase:
+    if (first := stages[0]).phase:
         # A command approaches a torque limit only asymptotically in the pause before.
         scene = first.formation.scene
         for joint in np.flatnonzero(scene.actuator_lag):
             limit = scene.torque_limit[joint]
             fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
             most = 1 - min(0.05, float(fastest))
-            rows.add_entries(rows.linear(1, low=-most, high=most), layout.tau[0, joint], 1 / limit)
+            bound = rows.linear(1, low=-most, high=most)
+            rows.add_entries(bound, layouts[0].tau[0, joint], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
