@@ -40,9 +40,8 @@ class Change(NamedTuple):
     def values(self) -> dict[str, float]:
         """What changes, as `Problem.with_` takes it."""
         parameter = self.parameter
-        return {parameter.key: self.value} | (
-            {parameter.mirrored: -self.value} if parameter.mirrored else {}
-        )
+        mirrored = {parameter.mirrored: -self.value} if parameter.mirrored else {}
+        return {parameter.key: self.value} | mirrored
 
     @property
     def relative(self) -> float:

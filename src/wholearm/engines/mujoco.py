@@ -262,9 +262,7 @@ def play(
     collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
     names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
     shares = {
-        name: sum(
-            stiffnesses[names.index(pair_name)] for pair_name in engine.find_pairs(name, corners)
-        )
+        name: sum(stiffnesses[names.index(pair)] for pair in engine.find_pairs(name, corners))
         or np.inf
         for name in stretch.c_n
     }

@@ -148,9 +148,8 @@ def read_torque_csv(path: str) -> TorqueProfile:
     for column in COLUMNS:
         if column not in header:
             names = ",".join(header) or "an empty file"
-            raise InputError(
-                str(path), column, f"column is missing; {names} given, {','.join(COLUMNS)} needed"
-            )
+            text = f"column is missing; {names} given, {','.join(COLUMNS)} needed"
+            raise InputError(str(path), column, text)
     where = {column: header.index(column) for column in COLUMNS}
     values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])
     if len(values) < 2:

@@ -168,9 +168,8 @@ class Trajectory(Drawn):
         t = self.t
         # Where a time is there twice, in a replay, the step is between the two rows.
         repeated = np.flatnonzero(np.diff(t) == 0) + 1
-        steps = np.searchsorted(
-            t, np.setdiff1d(breaks[stepping & inner], t[repeated]), side="right"
-        )
+        single = np.setdiff1d(breaks[stepping & inner], t[repeated])
+        steps = np.searchsorted(t, single, side="right")
         phases = np.append(np.flatnonzero(np.diff(self.phase)) + 1, repeated)
         # The friction of a contact that rolls passes zero without a step.
         slid = np.where(self.rolling, 0.0, self.c_t)

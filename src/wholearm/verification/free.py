@@ -79,9 +79,8 @@ def verify_free(
         warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
         failures += _fail(part, compared, allowed)
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
-    return FreeReport(
-        problem.name, whole, tuple(alone), tuple(by_clock), tuple(failures), tuple(warnings)
-    )
+    both = tuple(alone), tuple(by_clock)
+    return FreeReport(problem.name, whole, *both, tuple(failures), tuple(warnings))
 
 
 @exclusive
@@ -285,9 +284,8 @@ class LostContact(NamedTuple):
     def describe(self, phase: int | None = None) -> str:
         """Say it, and in which phase by its number if that is given."""
         where = "" if phase is None else f", phase {phase},"
-        return (
-            f"{self.contact} is lost at t = {self.time:.5g} s{where} and opens by {self.gap:.2g} m"
-        )
+        text = f"{self.contact} is lost at t = {self.time:.5g} s{where}"
+        return f"{text} and opens by {self.gap:.2g} m"
 
 
 class FreePhase(NamedTuple):
