@@ -36,7 +36,7 @@ def test_parameters_are_all_numbers_by_their_shortest_names(box: Problem) -> Non
     ("lenght1=0.1:0.2", "did you mean 'length1'"),
     ("phases[1].until.phi_deg=1:2", "did you mean 'phases[1].until.x'"),
     ("length1=1e-6:0.2", "1e-06 given; allowed are 0.00255"),
-    ("length1=0.2:0.1", "LOW has to be below HIGH"),
+    ("length1=0.2:0.1", "LOW below HIGH"),
     ("length1", "NAME=LOW:HIGH is needed"),
 ])  # fmt: skip
 def test_what_cannot_be_chosen_is_refused(box: Problem, text: str, words: str) -> None:

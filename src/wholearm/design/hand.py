@@ -31,7 +31,7 @@ from ..planning.result import UNITS, Plan
 from ..problem.definition import Problem
 from ..search import solve
 from .parameters import Parameter, find_parameter, require_allowed
-from .sweep import Planner
+from .sweep import Planner, read_vary
 
 RADII = (0.3, 0.1)  # of the first trust region of each run of COBYQA, over half a range
 FINE = 1e-2  # radius at which a run ends
@@ -61,15 +61,8 @@ def read_choices(problem: Problem, texts: Sequence[str], symmetric: bool = False
     wrong order, or a number is chosen twice.
     """
     choices, taken = list[Choice](), set[str]()
-    for text in texts:
-        name, _, numbers = text.partition("=")
-        try:
-            low, high = map(float, numbers.split(":"))
-        except ValueError:
-            raise InputError("", "--over", f"{text!r} given; NAME=LOW:HIGH is needed") from None
+    for name, (low, high) in read_vary(texts, 1, "--over").items():
         parameter = find_parameter(problem, name, "--over")
-        if not -math.inf < low < high < math.inf:
-            raise InputError("", f"--over {name}", f"{numbers} given; LOW has to be below HIGH")
         for end in (low, high):
             require_allowed(problem, parameter, end, "--over")
         factors = dict.fromkeys(parameter.keys, 1.0)

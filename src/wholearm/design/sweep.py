@@ -209,7 +209,9 @@ def show_value(value: Any) -> str:
     return text.lower() if isinstance(value, bool) else text
 
 
-def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ...]]:
+def read_vary(
+    texts: Sequence[str], samples: int = 0, option: str = "--vary"
+) -> dict[str, tuple[Any, ...]]:
     """Values of parameters from ``NAME=LOW:HIGH:COUNT`` or ``NAME=VALUE,VALUE``.
 
     Samples take ``NAME=LOW:HIGH``. Values that are no numbers are words.
@@ -225,10 +227,12 @@ def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ..
         if several and name and given and name not in vary:
             vary[name] = tuple(parts)
             continue
-        numbers = all(isinstance(part, Real) for part in parts) and "," not in given
-        if several or not numbers or len(parts) != 3 - bool(samples) or parts[0] >= parts[1]:
-            raise InputError("", "--vary", f"{text!r} given; {form} is needed, each name once")
-        count = Range(2, 10**6).read((*parts, 2)[2], f"--vary {name}: COUNT")
+        numbers = all(isinstance(part, Real) and math.isfinite(part) for part in parts)
+        wrong = several or "," in given or name in vary or len(parts) != 3 - bool(samples)
+        if wrong or not numbers or parts[0] >= parts[1]:
+            text = f"{text!r} given; {form} is needed, LOW below HIGH and each name once"
+            raise InputError("", option, text)
+        count = Range(2, 10**6).read((*parts, 2)[2], f"{option} {name}: COUNT")
         vary[name] = tuple(np.linspace(parts[0], parts[1], count).tolist())
     return vary
 
