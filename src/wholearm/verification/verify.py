@@ -436,32 +436,25 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     x = np.linspace(-1, 1, 33)
     values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
     rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
-    steps = np.abs(torque.jumps)
+    times = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * (1 + x) / 2
     misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
     for joint, (limit, fastest, lag) in enumerate(limits):
-        name = f"tau_{joint + 1}"
         if np.isinf(fastest) and not lag:
             continue
-        worst = int(steps[:, joint].argmax()) if len(steps) else 0
-        if len(steps) and steps[worst, joint] > 1e-5 * limit:
-            t = float(torque.breaks[worst + 1])
-            text = f"{name} steps by {steps[worst, joint]:.3g} N m at t = {t:.5g} s"
-            limited = f"its rate limit is {fastest:g} N m/s"
-            why = limited if np.isfinite(fastest) else "its motor lags"
-            misses.append((t, f"{text}, where {why}"))
-        kinds = (
-            (rates[:, joint], fastest, "changes at {:.4g} N m/s, above its rate limit {:g} N m/s"),
-            (commands[:, joint], limit, "takes a command of {:.4g} N m, above its limit {:g} N m"),
-        )
-        for of, most, text in kinds:
-            size = np.abs(of)
-            piece, look = np.unravel_index(int(size.argmax()), size.shape)
-            if size[piece, look] > most * (1 + 1e-3):
-                start, stop = torque.breaks[[piece, piece + 1]]
-                t = float(start + (stop - start) * (1 + x[look]) / 2)
-                said = text.format(size[piece, look], most)
-                misses.append((t, f"{name} {said}, at t = {t:.5g} s"))
+        limited = f"where its rate limit is {fastest:g} N m/s"
+        why = limited if np.isfinite(fastest) else "where its motor lags"
+        rate, command = f"above its rate limit {fastest:g} N m/s", f"above its limit {limit:g} N m"
+        for of, when, most, what, against in (
+            (torque.jumps, torque.breaks[1:-1], 1e-5 * limit, "steps by {:.3g} N m", why),
+            (rates, times, 1.001 * fastest, "changes at {:.4g} N m/s", rate),
+            (commands, times, 1.001 * limit, "takes a command of {:.4g} N m", command),
+        ):
+            sizes = np.abs(of[:, joint]).ravel()
+            if sizes.max(initial=0.0) > most:
+                worst = int(sizes.argmax())
+                t, size = float(when.ravel()[worst]), what.format(sizes[worst])
+                misses.append((t, f"tau_{joint + 1} {size} at t = {t:.5g} s, {against}"))
     return misses
 
 
