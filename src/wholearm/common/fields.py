@@ -336,16 +336,11 @@ def read_options(table: str) -> list[Option]:
         --brake             without the name of a value, a range or words: a switch
         --no-replay         a switch that is on
     """
-    rows: list[list[str]] = []
-    for line in table.strip().splitlines():
-        if line.startswith(" "):
-            rows[-1].append(line.strip())
-        else:
-            rows.append(re.split(r" {2,}", line, maxsplit=1))
-    return [_read_option(usage, " ".join(rest)) for usage, *rest in rows]
+    lines = re.sub(r"\n +", " ", table.strip()).splitlines()
+    return [_read_option(*re.split(r" {2,}", line, maxsplit=1)) for line in lines]
 
 
-def _read_option(usage: str, rest: str) -> Option:
+def _read_option(usage: str, rest: str = "") -> Option:
     match = _TEXT.fullmatch(rest)
     assert match is not None
     text, default, low, high, words = match.groups()
