@@ -3,7 +3,7 @@
 Contacts are counted as in `contact_table`: those with the palm, with finger 1 and with finger 2. A
 label is three of these numbers. Configurations with given labels are functions of (x, phi) in
 closed form: the height follows from the vertex on the palm, each joint angle from what the finger
-touches; so do their rates along a straight path (x', phi') with parameter u and x'' = phi'' = 0.
+touches. Rates along a straight path (x', phi') with x'' = phi'' = 0 follow from A z' = 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array, find_runs
 from ..common.errors import InputError
-from ..scene.model import Finger, Scene, cross_product
+from ..scene.model import Finger, Scene
 from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap
 from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
@@ -331,7 +331,7 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
     A, A_t = np.empty((2, *labels.shape, 5))
     for index in np.unique(labels).tolist():
         rows, places = np.nonzero(labels == index)
-        contact = evaluate_contacts(scene, [index], z[rows], v[rows])
+        contact = _make_single(scene, index).evaluate(z[rows], v[rows])
         C[rows, places], A_dot_v[rows, places] = contact.C[:, 0], contact.A_dot_v[:, 0]
         A[rows, places], A_t[rows, places] = contact.A[:, 0], contact.A_t[:, 0]
     return Kinematics(C, A, A_t, A_dot_v, A, A_dot_v)
@@ -374,117 +374,45 @@ def name_reach(scene: Scene, phi: float) -> str:
     return f"at that angle the hand closes for x {' and '.join(spans)}"
 
 
-class ExplicitMotion(NamedTuple):
-    """Straight paths at n places."""
-
-    # z, z_u, z_uu (n, 5): configurations, and their first and second derivatives along the paths
-    z: Array
-    z_u: Array
-    z_uu: Array
-    kinematics: Kinematics  # rows of the three contacts, with A' z_u
-
-
-class _Touch(NamedTuple):
-    """Poses at which a finger touches in one manner; vectors are in the world, from its joint."""
-
-    rows: Numbers  # which of the poses
-    kind: int
-    # arm, corner, outward (n, 2): the vertex from the centroid and from the joint; for an edge, the
-    # one where it begins, and its outward normal
-    arm: Array
-    corner: Array
-    outward: Array
-
-
 def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
-    z[:, 1] = -_turn(scene.polygon.vertices[labels[:, 0]], poses[:, 1])[:, 1]
+    body, normals = scene.polygon.vertices, _list_edges(scene)[2]
+    z[:, 1] = -_turn(body[labels[:, 0]], poses[:, 1])[:, 1]
     for finger, link in enumerate(scene.fingers):
         sign = 1.0 if finger == 0 else -1.0
-        for touch in _list_touches(scene, finger, labels[:, 1 + finger], z):
-            x, y = touch.corner.T
+        kinds, indices = np.divmod(labels[:, 1 + finger] - first_contact(scene, finger), len(body))
+        for kind in np.unique(kinds).tolist():
+            rows = np.flatnonzero(kinds == kind)
+            corner, outward = (_turn(x[indices[rows]], poses[rows, 1]) for x in (body, normals))
+            x, y = (corner + z[rows, :2] - np.asarray(link.base)).T
             with np.errstate(invalid="ignore", divide="ignore"):
-                angle = _find_angle(link, sign, touch.kind, x, y, touch.outward.T)
+                angle = _find_angle(link, sign, kind, x, y, outward.T)
             # Counted from where the finger hangs outside, from which it closes.
             outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
             swept = np.mod(sign * (angle - outside), 2 * np.pi)
-            z[touch.rows, 3 + finger] = outside + sign * swept
+            z[rows, 3 + finger] = outside + sign * swept
     return z
 
 
-def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitMotion:
-    """Rates along straight paths at poses (x, phi), rates (x', phi'), (n, 2), and labels (n, 3)."""
+def move(
+    scene: Scene, labels: Numbers, poses: Array, rates: Array
+) -> tuple[Array, Array, Array, Kinematics]:
+    """Straight paths at poses (x, phi) with rates (x', phi'), (n, 2), and labels (n, 3).
+
+    Returns configurations z, their derivatives z' and z'' along the paths, (n, 5), and kinematics.
+    """
     z = place(scene, labels, poses)
-    z_u, z_uu = np.zeros_like(z), np.zeros_like(z)
-    A, A_t, bend = np.zeros((len(z), 3, 5)), np.zeros((len(z), 3, 5)), np.zeros((len(z), 3))
-    arm, turn = _turn(scene.polygon.vertices[labels[:, 0]], z[:, 2]), rates[:, 1]
-    A[:, 0, 1], A[:, 0, 2] = 1.0, arm[:, 0]
-    A_t[:, 0, 0], A_t[:, 0, 2] = 1.0, -arm[:, 1]
-    bend[:, 0] = -(turn**2) * arm[:, 1]
-    z_u[:, [0, 2]] = rates
-    z_u[:, 1], z_uu[:, 1] = -arm[:, 0] * turn, -bend[:, 0]
-    for finger, link in enumerate(scene.fingers):
-        sign, joint = (1.0 if finger == 0 else -1.0), 3 + finger
-        for touch in _list_touches(scene, finger, labels[:, 1 + finger], z):
-            at, angle = touch.rows, z[touch.rows, joint]
-            axis = np.column_stack([np.cos(angle), np.sin(angle)])
-            tip, point = link.length * axis, touch.corner
-            if touch.kind == SIDE:
-                normal = sign * _quarter(axis)
-            elif touch.kind == EDGE:
-                normal = -touch.outward
-                point = tip + link.radius * normal
-            else:
-                normal = (point - tip) / link.radius
-            lever = touch.arm + point - touch.corner
-            for rows, along in ((A, normal), (A_t, -_quarter(normal))):
-                rows[at, 1 + finger, :2] = along
-                rows[at, 1 + finger, 2] = cross_product(lever, along)
-                rows[at, 1 + finger, joint] = -cross_product(point, along)
-            held = A[at, 1 + finger]
-            with np.errstate(invalid="ignore", divide="ignore"):
-                rate = -(held[:, :3] * z_u[at, :3]).sum(axis=1) / held[:, joint]
-                z_u[at, joint] = rate
-                bent = _bend(touch, link.radius, tip, normal, z_u[at], rate)
-                z_uu[at, joint] = -(bent + held[:, 1] * z_uu[at, 1]) / held[:, joint]
-            bend[at, 1 + finger] = bent
-    return ExplicitMotion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
-
-
-def _bend(
-    touch: _Touch, radius: float, tip: Array, normal: Array, rates: Array, rate: Array
-) -> Array:
-    """The gap's second derivative at constant rates of object, (n, 5), and joint, shape (n,)."""
-    turn = rates[:, 2:3]
-    rate = rate[:, None]
-    moved, fallen = rates[:, :2] + turn * _quarter(touch.arm), -(turn**2) * touch.arm
-    if touch.kind == SIDE:
-        parts = -(rate**2) * normal * touch.corner + normal * fallen
-        parts = parts + 2 * rate * _quarter(normal) * moved
-        return np.asarray(parts.sum(axis=1))
-    # The tip's centre as seen from the vertex.
-    apart, closing = tip - touch.corner, rate * _quarter(tip) - moved
-    bent = -(rate**2) * tip - fallen
-    if touch.kind == EDGE:
-        out = touch.outward
-        parts = -(turn**2) * out * apart + 2 * turn * _quarter(out) * closing + out * bent
-        return np.asarray(parts.sum(axis=1))
-    inwards, bends = (normal * closing).sum(axis=1), (normal * bent).sum(axis=1)
-    return np.asarray(((closing**2).sum(axis=1) - inwards**2) / radius - bends)
-
-
-def _list_touches(scene: Scene, finger: int, contacts: Numbers, z: Array) -> Iterator[_Touch]:
-    kinds, indices = np.divmod(contacts - first_contact(scene, finger), scene.polygon.n_vertices)
-    body, base = scene.polygon.vertices, np.asarray(scene.fingers[finger].base)
-    for kind in (SIDE, EDGE, ARC):
-        rows = np.flatnonzero(kinds == kind)
-        if len(rows):
-            index, at = indices[rows], z[rows]
-            arm = _turn(body[index], at[:, 2])
-            outward = _turn(_list_edges(scene)[2][index], at[:, 2]) if kind == EDGE else arm
-            yield _Touch(rows, kind, arm, arm + at[:, :2] - base, outward)
+    A = evaluate_each(scene, labels, z).A
+    z_u, z_uu, levers = np.zeros_like(z), np.zeros_like(z), A[:, [1, 2], [3, 4]]
+    z_u[:, [0, 2]], z_u[:, 1] = rates, -A[:, 0, 2] * rates[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z_u[:, 3:] = -np.einsum("nij,nj->ni", A[:, 1:, :3], z_u[:, :3]) / levers
+        at = evaluate_each(scene, labels, z, z_u)
+        z_uu[:, 1] = -at.A_dot_v[:, 0]
+        z_uu[:, 3:] = -(at.A_dot_v[:, 1:] + A[:, 1:, 1] * z_uu[:, 1:2]) / levers
+    return z, z_u, z_uu, at
 
 
 def _turn(vectors: Array, phi: Array) -> Array:
@@ -492,11 +420,4 @@ def _turn(vectors: Array, phi: Array) -> Array:
     turned = np.empty_like(vectors)
     turned[:, 0] = c * vectors[:, 0] - s * vectors[:, 1]
     turned[:, 1] = s * vectors[:, 0] + c * vectors[:, 1]
-    return turned
-
-
-def _quarter(vectors: Array) -> Array:
-    """Vectors turned by +90 degrees."""
-    turned = np.empty_like(vectors)
-    turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
     return turned

@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from ..common.arrays import Array, find_root
 from ..common.errors import InputError, name_source
@@ -344,20 +345,10 @@ def build_panel(
 @lru_cache(maxsize=1)
 def _chebyshev() -> tuple[Array, Array, Array]:
     """Lobatto nodes on [0, 1], the matrix of integrals from 0, and that of coefficients."""
-    n = NODES - 1
-    angles = np.pi * np.arange(NODES) / n
-    unit = (1 - np.cos(angles)) / 2
-    vandermonde = np.cos(np.outer(np.pi - angles, np.arange(NODES + 1)))
-    analyse = np.linalg.inv(vandermonde[:, :NODES])
-    integral = np.zeros((NODES, NODES))
-    x = 2 * unit - 1
-    integral[:, 0] = x + 1
-    integral[:, 1] = (x**2 - 1) / 2
-    for k in range(2, NODES):
-        above, below = vandermonde[:, k + 1] / (k + 1), vandermonde[:, k - 1] / (k - 1)
-        term = (above - below) / 2
-        integral[:, k] = term - term[0]
-    return unit, integral @ analyse / 2, analyse
+    x = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
+    analyse = np.asarray(np.linalg.inv(chebyshev.chebvander(x, NODES - 1)), dtype=float)
+    integral = chebyshev.chebvander(x, NODES) @ chebyshev.chebint(np.eye(NODES), lbnd=-1)
+    return (1 + x) / 2, (integral - integral[0]) @ analyse / 2, analyse
 
 
 @dataclass(frozen=True, eq=False)

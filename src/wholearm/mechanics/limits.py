@@ -94,6 +94,7 @@ class LimitSet:
         """The limits of other kinds."""
         return LimitSet(tuple(limit for limit in self.limits if limit.kind not in kinds))
 
+    @cached_property
     def split_speeds(self) -> tuple[LimitSet, LimitSet]:
         """The limits that depend on forces or torques, and those of joint speeds alone."""
         alone = [not limit.rows[:, :-2].any() for limit in self.limits]

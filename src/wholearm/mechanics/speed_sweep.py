@@ -160,14 +160,17 @@ def _pass(slopes: Array, values: Array, top: Array, floor: float) -> Array:
 
     Rows of slopes and values, (N, w, m), bound it by the b before, `top`, (N, w), by itself.
     """
-    slopes = np.concatenate([slopes, np.zeros((*top.shape, 1))], axis=2)
-    values = np.concatenate([values, top[..., None]], axis=2)
-    b, nodes = np.zeros((top.shape[1], 1)), list[Array]()
+    # Paths last: then the minimum over rows is vectorized.
+    slopes, values = (
+        np.ascontiguousarray(np.concatenate([rows, last[..., None]], axis=2).swapaxes(1, 2))
+        for rows, last in ((slopes, np.zeros(top.shape)), (values, top))
+    )
+    b, nodes = np.zeros(top.shape[1]), list[Array]()
     for slope, value in zip(slopes, values, strict=True):
-        b = np.minimum.reduce(slope * b + value, axis=1, keepdims=True)
+        b = np.minimum.reduce(slope * b + value, axis=0)
         nodes.append(b)
         b = np.maximum(b, floor)
-    return np.array(nodes)[..., 0]
+    return np.array(nodes)
 
 
 def _split(

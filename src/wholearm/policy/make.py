@@ -134,7 +134,7 @@ def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
 
     Speed limits are kept by the plan, and no motion of a policy is faster.
     """
-    limits, _ = make_limits(formation, 0.0).split_speeds()
+    limits, _ = make_limits(formation, 0.0).split_speeds
     pairs = [(limit, limit.rows[:, :-4].any()) for limit in limits.limits]
     contact, joint = ([limit for limit, own in pairs if own == kind] for kind in (True, False))
     return LimitSet(tuple(contact)), LimitSet(tuple(joint))

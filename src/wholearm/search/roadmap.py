@@ -86,16 +86,17 @@ def evaluate_paths(
     scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array
 ) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
-    at, (formation, limits) = move(scene, labels, poses, runs), _make_limits(scene, epsilon)
-    directions, kinematics = Directions.of(at.kinematics, at.z_u), at.kinematics
+    formation, limits = _make_limits(scene, epsilon)
+    z, z_u, z_uu, kinematics = move(scene, labels, poses, runs)
+    directions = Directions.of(kinematics, z_u)
     try:
-        forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
+        forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
     except np.linalg.LinAlgError:
         wrenches = force_rows(formation, kinematics, directions)[:, :, :3]
         unheld = np.equal(np.linalg.det(wrenches), 0.0).reshape(-1, 1, 1)
         kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
-        forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
-    rows, cap = PathLimits.of(limits, forces, at.z_u[:, 3:], GIVE)
+        forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
+    rows, cap = PathLimits.of(limits, forces, z_u[:, 3:], GIVE)
     # No motion where three contacts cannot balance the object, or a finger cannot reach it.
     held = np.asarray(np.isfinite(rows).all(axis=(1, 2)))
     rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])
