@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -175,6 +175,32 @@ class AmbiguityError(JammingError):
 
 class SimulationError(_PhaseError):
     """The forward simulation cannot go on (step size underflow, inconsistent start)."""
+
+
+def round_outwards(value: float, sign: int) -> float:
+    """Round to three significant digits, up for the sign 1 and down for -1."""
+    if value == 0 or not math.isfinite(value):
+        return value
+    place = 2 - math.floor(math.log10(abs(value)))
+    # Values of so few digits stay, whatever their last bits are.
+    scaled = round(value * 10.0**place, 6)
+    return float(f"{math.ceil(scaled) if sign > 0 else math.floor(scaled)}e{-place}")
+
+
+def describe_changes(changes: Sequence[Change]) -> str:
+    """All changes in one line."""
+    if not changes:
+        return "no single limit makes it feasible"
+    return f"feasible with {', or '.join(map(str, changes))}"
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    first, *others = phases
+    if not others:
+        return f"phase {first} is {what}" if what else f"phase {first}"
+    several = f"phases {first} {'and' if len(others) == 1 else 'to'} {others[-1]}"
+    return f"{several} are {what}" if what else several
 
 
 def require_number(

@@ -112,12 +112,7 @@ class PathLimits(NamedTuple):
 
     def find_internal_force_range(self, a: Array, b: Array) -> tuple[Array, Array]:
         """Least and largest lambda that the rows allow for a motion, (n,); crossed if none."""
-        slack, by = self.find_slack(a, b, np.zeros_like(b)), self.rows[..., LAMBDA]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bound = -slack / by
-        never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
-        low = np.where(by > 0, bound, never).max(axis=1, initial=-np.inf)
-        return low, np.where(by < 0, bound, np.inf).min(axis=1, initial=np.inf)
+        return find_range(self.rows[..., LAMBDA], self.find_slack(a, b, np.zeros_like(b)))
 
     def extreme(self, b: Array, largest: bool) -> Extreme:
         """The largest or least a at n places for b of shape (n,): of tied rows by the first."""
@@ -135,12 +130,8 @@ class PathLimits(NamedTuple):
 
     def can_rest(self, sign: float = 1.0) -> NDArray[np.bool_]:
         """Whether rows without lambda allow an a of some `sign`, or zero, at rest, shape (...,)."""
-        of_a, one = sign * self.rows[..., A], self.rows[..., ONE]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            least = np.where(of_a > 0, -one / of_a, 0.0).max(axis=-1)
-            most = np.where(of_a < 0, -one / of_a, np.inf).min(axis=-1)
-        never = ((of_a == 0) & (one < 0)).any(axis=-1)
-        return np.asarray((np.maximum(least, 0.0) <= most) & ~never)
+        least, most = find_range(sign * self.rows[..., A], self.rows[..., ONE])
+        return np.asarray((np.maximum(least, 0.0) <= most) & (least < np.inf))
 
     def find_largest_b(self) -> Array:
         """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
@@ -154,6 +145,15 @@ class PathLimits(NamedTuple):
         bounded = (up > 0) & (down > 0) & (b < 0)
         largest = np.where(bounded, np.maximum(root, 0), np.inf).min(axis=(1, 2))
         return np.asarray(np.minimum(largest**2, self.cap))
+
+
+def find_range(by: Array, slack: Array) -> tuple[Array, Array]:
+    """Least and largest x of by x + slack >= 0, rows (..., m); crossed or infinite if none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -slack / by
+    never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
+    low = np.where(by > 0, bound, never).max(axis=-1, initial=-np.inf)
+    return low, np.where(by < 0, bound, np.inf).min(axis=-1, initial=np.inf)
 
 
 def find_value_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:

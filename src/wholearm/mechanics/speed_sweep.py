@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from .dynamics import ONE, A, B, V
-from .path_limits import PathLimits
+from .path_limits import PathLimits, find_range
 
 _ROUNDING = 1e-12  # negative b at the end that is rounding, over the largest b
 _UNBOUNDED = 1e100  # b [m^2/s^2] where no limit bounds it; case: the map of a rolling octagon
@@ -293,10 +293,5 @@ def _find_range(rows: Array) -> tuple[float, float]:
     rise, fall = after[up, None], -after[down]
     value = np.append(fall * one[up, None] + rise * one[down], one[flat])
     slope = np.append(fall * before[up, None] + rise * before[down], before[flat])
-    if (value[slope == 0] < -_ROUNDING).any():
-        return 1.0, -1.0
-    low, high = slope > 0, slope < 0
-    return (
-        float((-value[low] / slope[low]).max(initial=-np.inf)),
-        float((-value[high] / slope[high]).min(initial=np.inf)),
-    )
+    low, high = find_range(slope, value + _ROUNDING * (slope == 0))
+    return float(low), float(high)

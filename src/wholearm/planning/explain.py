@@ -30,6 +30,9 @@ from ..common.errors import (
     Shortfall,
     SolverError,
     WholearmError,
+    describe_changes,
+    name_phases,
+    round_outwards,
 )
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, describe_pose
@@ -161,32 +164,6 @@ def list_beyond(parameter: Parameter, least: float) -> list[float]:
     """
     shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
     return [math.nan, *(least * (1 + parameter.sign * share) for share in shares)]
-
-
-def round_outwards(value: float, sign: int) -> float:
-    """Round to three significant digits, up for the sign 1 and down for -1."""
-    if value == 0 or not math.isfinite(value):
-        return value
-    place = 2 - math.floor(math.log10(abs(value)))
-    # Values of so few digits stay, whatever their last bits are.
-    scaled = round(value * 10.0**place, 6)
-    return float(f"{math.ceil(scaled) if sign > 0 else math.floor(scaled)}e{-place}")
-
-
-def describe_changes(changes: Sequence[Change]) -> str:
-    """All changes in one line."""
-    if not changes:
-        return "no single limit makes it feasible"
-    return f"feasible with {', or '.join(map(str, changes))}"
-
-
-def name_phases(phases: Sequence[int], what: str = "") -> str:
-    """One phase or several, for messages, and that they are `what`."""
-    first, *others = phases
-    if not others:
-        return f"phase {first} is {what}" if what else f"phase {first}"
-    several = f"phases {first} {'and' if len(others) == 1 else 'to'} {others[-1]}"
-    return f"{several} are {what}" if what else several
 
 
 def change_scene(scene: Scene, key: str, value: float) -> Scene:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.document import plain
-from ..common.errors import Change, InfeasibleError, Parameter
+from ..common.errors import Change, InfeasibleError, Parameter, describe_changes, round_outwards
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curves
 from ..mechanics.impact import Impact
@@ -124,8 +124,6 @@ def share_duration(
     """
     least = sum(times)
     if duration <= least:
-        from .explain import describe_changes, round_outwards
-
         # The least-time plan shows it; a little more leaves something to choose.
         parameter = Parameter("duration", duration, "s", 1, "duration")
         changes = [Change(parameter, round_outwards(1.005 * least, 1))] * (not stops)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
@@ -92,10 +92,10 @@ def measure_apart(scene: Scene, z: Array, other: Array) -> float:
     return float(np.abs((z - other) / [length, length, 1, 1, 1]).max())
 
 
-def is_flush(place: RoadmapPlace, edge: int) -> bool:
-    """Whether an edge lies on the palm."""
-    count = place.scene.polygon.n_vertices
-    return {edge, (edge + 1) % count} <= {c.index for c in place.contacts if c.finger is None}
+def is_flush(scene: Scene, contacts: Sequence[Contact], edge: int) -> bool:
+    """Whether an edge lies on the palm with these contacts."""
+    ends = {edge, (edge + 1) % scene.polygon.n_vertices}
+    return ends <= {c.index for c in contacts if c.finger is None}
 
 
 def is_at(place: RoadmapPlace, goal: Goal) -> bool:
@@ -104,7 +104,7 @@ def is_at(place: RoadmapPlace, goal: Goal) -> bool:
     if goal.x is not None and abs(place.z[0] - goal.x) > HELD * scene.scales.length:
         return False
     if goal.flush is not None:
-        return is_flush(place, goal.flush)
+        return is_flush(scene, place.contacts, goal.flush)
     assert goal.phi is not None
     return bool(abs(place.z[2] - goal.phi) < HELD)
 
@@ -116,9 +116,7 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
     """
     scene = curve.formation.scene
     if goal.flush is not None:
-        palm = {c.index for c in curve.formation.contacts if c.finger is None}
-        count = scene.polygon.n_vertices
-        if goal.x is None or {goal.flush, (goal.flush + 1) % count} != palm:
+        if goal.x is None or not is_flush(scene, curve.formation.contacts, goal.flush):
             return None
         s = _find_first(curve, 0, goal.x)
         return None if s is None else (s, Until(coordinate="x", value=goal.x))

@@ -265,7 +265,8 @@ class Roadmap:
         moved, near = list[Edge](), NEAR * self.scene.scales.length
         for edge in edges:
             *before, last = edge.steps
-            if not is_flush(edge.stop, goal.flush) or abs(edge.stop.z[0] - goal.x) > near:
+            flush = is_flush(self.scene, edge.stop.contacts, goal.flush)
+            if not flush or abs(edge.stop.z[0] - goal.x) > near:
                 continue
             formation = Formation(self.scene, edge.stop.contacts)
             z = close_contacts(formation, edge.stop.z, np.zeros(0), ((0, goal.x),))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import AmbiguityError, JammingError, SolverError
+from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
 from ...mechanics.limits import PRESS
@@ -119,7 +119,7 @@ def plan_curves(
     except SolverError as stuck:
         from ..explain import explain_curves
 
-        reason = f"{task.name}: {stuck}"
+        reason = f"{name_phases(phases)}: {stuck}"
         error = explain_curves(task, reason) if explained else SolverError(reason)
         if task.guides and isinstance(error, SolverError):
             # The reference is a plan without ranges; case: the block of two landings of a pentagon.
@@ -131,14 +131,12 @@ def plan_curves(
         raise error from None
     rounding = MISS * curves[0].formation.scene.scales.force
     if options.goal is Objective.MARGIN and iterate.plans[0].value < epsilon - rounding:
-        from ..explain import name_phases
-
         if duration is not None:
             fastest = replace(options, objective=Objective.TIME, duration=None)
             least = plan_task(replace(task, options=fastest, duration=None)).plans
             where = f"{name_phases(phases, 'infeasible')}: "
             share_duration([plan.value for plan in least], duration, where)
-        raise SolverError(f"{task.name}: the margin found is below epsilon")
+        raise SolverError(f"{name_phases(phases)}: the margin found is below epsilon")
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
     return iterate.plans if surely else _leave_rest(iterate)
@@ -277,13 +275,6 @@ class Task:
     def is_held(self) -> bool:
         """Whether motions start and end without acceleration, as torques may not step."""
         return self.curves[0].formation.scene.has_slow_motors
-
-    @property
-    def name(self) -> str:
-        """The phases, for messages."""
-        from ..explain import name_phases
-
-        return name_phases(self.phases)
 
     @property
     def elements(self) -> int:

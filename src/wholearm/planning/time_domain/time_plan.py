@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmError
+from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmError, name_phases
 from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
@@ -102,7 +102,7 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    from ..explain import change_limit, name_phases, refuse
+    from ..explain import change_limit, refuse
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     guesses = Guesses(problem, phases, z, search, to_go)
