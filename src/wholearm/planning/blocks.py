@@ -139,11 +139,12 @@ def plan_blocks(
         first = replace(
             planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
         )
-        least = plan_each(first, report).plans
+        least = plan_each(_begin_each(first, report), report).plans
         times = [plan.motion.duration for plan in least]
         longest = 2 * sum(times) if options.duration is None else options.duration
         planning = replace(planning, allowed=share_duration(times, longest), least=least)
-    return plan_each(planning, report)
+        return plan_each(planning, report)
+    return plan_each(_begin_each(planning, report), report)
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
@@ -154,13 +155,49 @@ def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     return _require_margin(made)
 
 
+def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
+    """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
+
+    What refuses a later phase is soon told. Blocks along curves after it have none, as they will
+    begin elsewhere: they are traced alone. An error is raised only if it does not depend on where
+    exactly the block before ends.
+    """
+    blocks, coarse, scene = split_blocks(planning.problem), planning, planning.problem.scene
+    over_time = [not runs_along_curves(block, planning.options) for block in blocks]
+    if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
+        return planning
+    for index, block in enumerate(blocks):
+        after = any(over_time[:index])
+        try:
+            if after and not over_time[index]:
+                z = coarse.blocks[-1].end
+                traced = BlockPlan(block, z, [], trace_block(coarse, block, z), coarse=True)
+                coarse = replace(coarse, blocks=(*coarse.blocks, traced))
+            else:
+                coarse = plan_next(coarse, None, report, coarse=True)
+        except WholearmError as error:
+            short = error.shortfalls if isinstance(error, InfeasibleError) else ()
+            # A better plan of earlier phases does not help against large violations.
+            if not after or any(shortfall.share > 0.05 for shortfall in short):
+                raise
+            break
+    return coarse
+
+
 def plan_next(
-    planning: Planning, known: BlockPlan | None, report: Callable[[str], None]
+    planning: Planning,
+    known: BlockPlan | None,
+    report: Callable[[str], None],
+    coarse: bool = False,
 ) -> Planning:
-    """Plan the next block, unless `known` is its plan; a coarse one is the guess."""
+    """Plan the next block, in the time domain coarsely if asked, unless `known` is its plan.
+
+    A coarse one is the guess.
+    """
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
     z = planning.blocks[-1].end if planning.blocks else problem.start
+    coarse = coarse and not runs_along_curves(phases, options)
     rounding = 1e-9 * problem.scene.scales.length
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.coarse:
@@ -178,8 +215,9 @@ def plan_next(
                 ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                 fastest=[least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.coarse else (),
+                only_begin=coarse,
             )
-        known = BlockPlan(phases, z, *made)
+        known = BlockPlan(phases, z, *made, coarse)
     return replace(planning, blocks=(*planning.blocks, known))
 
 
