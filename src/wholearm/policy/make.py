@@ -58,9 +58,9 @@ class ReferenceSettings:
 
     late: float = 5e-4  # uncertainty of the delay without ranges [s]
     least: float = 0.02  # least margin of a normal force, over the scene's unit of force
-    spare: float = 0.05  # margin of a torque for feedback, over its limit
+    spare: float = 0.02  # margin of a torque for feedback, over its limit
     kept: float = 1.3  # margin of the reference's forces within ranges, over those of the law
-    authority: float = 2.0  # margin of the reference's torques, over those of the law
+    authority: float = 5.0  # margin of the reference's torques, over those of the law
     near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
     arrival: float = 6e-3  # time constant of the approach to the end [s]
