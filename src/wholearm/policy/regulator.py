@@ -103,10 +103,14 @@ def follow(
     slow : bool  whether the last torques press all contacts in a slow motion
     """
     starts, t = plan.phase_starts, end_within(phases, plan, t)
-    owner = np.searchsorted(starts, t, side="right") - 1
-    owner = owner.clip(phases[0].index, phases[-1].index)
-    parts = [part for phase in phases for part in _divide(phase, plan, t[owner == phase.index])]
-    scene = problem.scene
+    step, scene = float(t[1] - t[0]), problem.scene
+
+    def divide(t: Array) -> list[RegulatedStretch]:
+        owner = np.searchsorted(starts, t, side="right") - 1
+        owner = owner.clip(phases[0].index, phases[-1].index)
+        return [part for phase in phases for part in _divide(phase, plan, t[owner == phase.index])]
+
+    parts = divide(t)
     unit, limit = PRESS * scene.scales.force, scene.torque_limit
 
     def find_margin(b: float) -> float:
@@ -116,12 +120,15 @@ def follow(
 
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
-    tau = np.concatenate([part.find_torques(b) for part in parts])
+    # Mean torques of a period have the plan's impulse, also where it steps.
+    within = np.clip(t[:, None] + step * (np.arange(8) - 3.5) / 8, t[0], t[-1]).ravel()
+    torques = np.concatenate([part.find_torques(b) for part in divide(within)])
+    tau = torques.reshape(-1, 8, 2).mean(axis=1)
     # Beyond the end the motion goes on slowly, where that presses all contacts.
     slow = parts[-1].find_forces(0.0)[-1, : parts[-1].formation.n_contacts].min() > 0.0
     if slow:
         tau[-1] = parts[-1].find_torques(0.0)[-1]
-    return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b)), bool(slow)
+    return b, tau, regulate(linearizations, step / np.sqrt(b)), bool(slow)
 
 
 def _divide(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
