@@ -261,8 +261,7 @@ def _plan_over_time(
     """Plans of a block in the time domain, from those with free torques if these are limited.
 
     Under rate limits in the first modes with free torques, then in those of the search: phases 5
-    and 6 of the heptagon have a plan from the former alone, phases 6 and 7 of query 0 from the
-    latter.
+    and 6 of the heptagon have a plan from the former alone, phase 15 of query 28 from the latter.
     """
     from .time_domain.time_plan import plan_with_impacts
 

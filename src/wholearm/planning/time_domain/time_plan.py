@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, islice, pairwise, takewhile
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -464,11 +465,12 @@ def cut_periods(
     The duration of periods is then given, or only that they are `equal`.
     """
     cut, near = list[Stage](), _BRIEF * period
-    for _, group in groupby(stages, key=lambda stage: stage.phase):
+    for stages_of_phase in (list(group) for _, group in groupby(stages, key=attrgetter("phase"))):
         start = 0.0
-        for stage in group:
+        for stage in stages_of_phase:
             stop = start + stretch * stage.guess.duration
-            if stage.fading and stop - start > period / 2:
+            within = stage is not stages_of_phase[-1]
+            if within and stage.fading and stop - start > period / 2:
                 # Forces step there, as torques do between periods: phase 9 of query 28 has no plan
                 # in which a contact that rolls begins to slide within a period.
                 stop = period * max(math.floor(start / period + 1 - _BRIEF), round(stop / period))
