@@ -452,7 +452,8 @@ class MotionLaw:
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or at the end."""
-        self.clock = self.end if at_end else 0.0
+        # The motion begins when its first torques take effect.
+        self.clock = self.end if at_end else -self.settings.delay
         self.passed = len(self.starts) - 1 if at_end else 0
         self.over = self.pushes = False
         self.rested = self.held = 0.0
@@ -521,7 +522,7 @@ class MotionLaw:
 
     def _locate(self, t: float) -> tuple[int, float]:
         """Sample before a time, and the share of the interval after it."""
-        place = min(t, self.end) / self.every
+        place = min(max(t, 0.0), self.end) / self.every
         k = min(int(place), len(self.theta) - 2)
         return k, min(place - k, 1.0)
 
