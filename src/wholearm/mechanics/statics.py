@@ -179,10 +179,8 @@ class Statics:
         end with an acceleration. Each has its margin of c_n over epsilon [N], and signs of sliding
         and turning, (n_c + 2,). None with more than two degrees of freedom.
         """
-        possible, modes = (
-            list[tuple[float, tuple[float, ...]]](),
-            list(self._list_modes(held is not None)),
-        )
+        possible = list[tuple[float, tuple[float, ...]]]()
+        modes = list(self._list_modes(held is not None))
         for mode in modes:
             still = _Mode(mode.N[:, :0], mode.rates[:, :0], mode.opens[:0, :0], mode.signs)
             each = [self._start(mode, epsilon, within=held)]

@@ -276,25 +276,11 @@ class CurveLaw:
 
     def _list_levels(self, j: int, share: float, v: float) -> Levels:
         """Levels at a place and a speed, and their coefficients of a and internal force."""
-        b = v * v
-        base, rates, press = [], [], []
-        for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
-            self.levels[j], self.level_rises[j], strict=True
-        ):
-            base.append(c + share * d + (cb + share * db) * b + (cv + share * dv) * v)
-            rates.append(ca + share * da)
-            press.append(cl + share * dl)
-        return base, rates, press
+        return _evaluate(self.levels[j], self.level_rises[j], share, v)
 
     def _list_torques(self, j: int, share: float, v: float) -> list[tuple[float, float, float]]:
-        """Torques at a place and a speed, and their coefficients of a and internal force."""
-        torques = []
-        for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
-            self.torque[j], self.torque_rises[j], strict=True
-        ):
-            moving = c + share * d + (cb + share * db) * v * v + (cv + share * dv) * v
-            torques.append((moving, ca + share * da, cl + share * dl))
-        return torques
+        """Torques at a place and a speed, each with its coefficients of a and internal force."""
+        return list(zip(*_evaluate(self.torque[j], self.torque_rises[j], share, v), strict=True))
 
     def _list_levels_across(
         self, torques: Sequence[tuple[float, float, float]], j: int, share: float, v: float
@@ -374,6 +360,17 @@ class CurveLaw:
         self.rested = self.rested + settings.period if abs(v) < settings.still else 0.0
         self.over = self.rested > dwell + settings.delay
         return tau
+
+
+def _evaluate(first: Rows, rises: Rows, share: float, v: float) -> Levels:
+    """Rows of an interval at a share of it and a speed, and their coefficients."""
+    b = v * v
+    base, rates, press = [], [], []
+    for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(first, rises, strict=True):
+        base.append(c + share * d + (cb + share * db) * b + (cv + share * dv) * v)
+        rates.append(ca + share * da)
+        press.append(cl + share * dl)
+    return base, rates, press
 
 
 def _choose_motion(

@@ -67,6 +67,12 @@ DWELL = FieldKind(
 """A time, or a share of the motion's."""
 
 
+def _find_way(place: tuple[str, float], z: Array, length: float) -> float:
+    """How far z, shape (5,), is from a coordinate's value, x over a `length` and phi in rad."""
+    name, value = place
+    return float(abs(z[ROWS[name]] - value)) / (length if name == "x" else 1.0)
+
+
 @dataclass(frozen=True)
 class Until:
     """What ends a phase: a contact gained, a coordinate of the pose reached, or a release.
@@ -93,9 +99,7 @@ class Until:
 
     def measure_pins(self, z: Array, length: float) -> float:
         """How far z, shape (5,), is from the pins at most, x over a `length` and phi in rad."""
-        units = {"x": length, "phi": 1.0}
-        off = (abs(z[ROWS[name]] - value) / units[name] for name, value in self.pins)
-        return float(max(off, default=0.0))
+        return max((_find_way(pin, z, length) for pin in self.pins), default=0.0)
 
     def lead(self, z: Array, length: float) -> Until:
         """The same with the coordinate first that has the longest way from z, shape (5,).
@@ -104,12 +108,8 @@ class Until:
         """
         if self.value is None or not self.pins:
             return self
-        units = {"x": length, "phi": 1.0}
-        ways = [abs(z[ROWS[name]] - value) / units[name] for name, value in self.coordinates]
-        first, *pins = sorted(
-            self.coordinates, key=lambda pair: -ways[self.coordinates.index(pair)]
-        )
-        return replace(self, coordinate=first[0], value=first[1], pins=tuple(pins))
+        (name, value), *pins = sorted(self.coordinates, key=lambda at: -_find_way(at, z, length))
+        return replace(self, coordinate=name, value=value, pins=tuple(pins))
 
     @property
     def is_release(self) -> bool:

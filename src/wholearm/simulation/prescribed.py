@@ -138,7 +138,8 @@ def _build_leg(
     if until.is_release:
         distance = ca.SX(1)
     elif until.contact is None:
-        distance = side * (z[0 if until.coordinate == "x" else 2] - until.value)
+        row, value = until.poses[0]
+        distance = side * (z[row] - value)
     elif gained:
         # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
         distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
@@ -664,8 +665,8 @@ class Replay(Run):
         )
         self.side = 1.0
         if until.value is not None:
-            place = self.y[0 if until.coordinate == "x" else 2]
-            self.side = math.copysign(1.0, place - until.value)
+            row, value = until.poses[0]
+            self.side = math.copysign(1.0, self.y[row] - value)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()

@@ -221,7 +221,8 @@ def _find_end(
         closed = [s for s in simulation.stretches if s.contact == until.contact.name]
         times += [max(s.start, start) for s in closed if s.stop > start]
     elif until.value is not None:
-        values = simulation.z[:, 0 if until.coordinate == "x" else 2] - until.value
+        column, value = until.poses[0]
+        values = simulation.z[:, column] - value
         rows = np.flatnonzero(simulation.t >= start)
         passed = rows[values[rows] * values[rows[0]] <= 0]
         times = simulation.t[passed[:1]].tolist()

@@ -677,9 +677,8 @@ def _measure_distance(
     if until.contact is not None:
         at = Formation(scene, (until.contact,)).evaluate(z, v)
         return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
-    column = 0 if until.coordinate == "x" else 2
-    assert until.value is not None
-    offset = z[:, column] - until.value
+    column, value = until.poses[0]
+    offset = z[:, column] - value
     side = math.copysign(1.0, offset[0])
     gradient = np.zeros((len(z), 5))
     gradient[:, column] = side
