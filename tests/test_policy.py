@@ -25,6 +25,7 @@ from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
+    SETTINGS,
     find_widest,
     find_within,
     list_scenes,
@@ -41,6 +42,7 @@ from wholearm.policy.regulator import (
     regulate,
     tabulate_motion,
 )
+from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.simulation.simulate import simulate_free
@@ -255,6 +257,21 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         signs = np.sign(phase.formation.evaluate(z[None], v[None]).A_t[0] @ v), np.sign(v[3:])
         c = build_forward(phase.formation)(z, v, tau, *signs)[1].full()
         assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone
+
+
+def test_a_stop_where_a_contact_changes_its_name_is_passed() -> None:
+    # Nothing stops the joints there: they would go on to well beyond the border.
+    problem = part_of(build_problem(tomllib.loads(PENTAGON)), 0, 3)
+    phases = tuple(replace(phase, end=End.REST) for phase in problem.phases)
+    problem = replace(problem, phases=phases)
+    plan = wholearm.solve(problem, replay=False).trajectory
+    policy = make_policy(problem, plan)
+    assert [len(law.starts) for law in policy.laws] == [1, 2]
+    report = verify_policy(problem, plan, policy)
+    assert report.ok and not report.phases[2].losses
+    row = np.flatnonzero(report.trajectory.t > report.phases[2].start)[0]
+    speed = np.abs(report.trajectory.z_dot[row, 3:]).max()
+    assert speed > 0.1 * SETTINGS.touch * problem.scene.scales.rate
 
 
 def test_a_contact_may_be_open_for_a_moment_where_a_phase_begins(problem: Problem) -> None:

@@ -198,8 +198,11 @@ def follow(
     return trial.judge(simulation)
 
 
-ONE = (TimeWindow(1, 1.0, ("a", "b"), "c"),)
-TWO = (TimeWindow(1, 0.5, ("a", "b"), "c"), TimeWindow(2, 1.0, ("b", "c"), ""))
+ONE = (TimeWindow(1, 1.0, ("a", "b"), {"c", "d"}, {}),)
+TWO = (
+    TimeWindow(1, 0.5, ("a", "b"), {"c", "d"}, {}),
+    TimeWindow(2, 1.0, ("b", "c"), set(), {"c": {"d"}}),
+)
 
 
 @each(
@@ -218,6 +221,8 @@ TWO = (TimeWindow(1, 0.5, ("a", "b"), "c"), TimeWindow(2, 1.0, ("b", "c"), ""))
         ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.53, 1)], TWO, None),
         ([("a", 0, 0.45), ("b", 0, 1), ("c", 0.46, 1)], TWO, None),
         ([("a", 0, 0.44), ("b", 0, 1), ("c", 0.46, 1)], TWO, ("a", 1, 0.44)),
+        # The gained contact presses as that of a neighbouring feature.
+        ([("a", 0, 0.46), ("b", 0, 1), ("d", 0.46, 0.7), ("c", 0.7, 1)], TWO, None),
         ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.5, 0.8)], TWO, ("c", 2, 0.8)),
         ([("a", 0, 0.5), ("b", 0, 1)], TWO, ("c", 1, 0.5)),
     ],

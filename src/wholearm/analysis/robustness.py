@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,7 +34,7 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
-from ..verification.free import MOMENT, REACHED, TURNED, list_aliases
+from ..verification.free import MOMENT, REACHED, TURNED, list_aliases, list_gained
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
@@ -141,9 +141,9 @@ class TimeWindow(NamedTuple):
     phase: int  # its number
     stop: float  # [s]
     contacts: tuple[str, ...]  # that it is planned with
-    gained: str  # the contact that it ends with; empty where it ends otherwise
+    gained: Collection[str]  # that it ends with, as of `list_gained`
+    aliases: Mapping[str, set[str]]  # as of `list_aliases`
     start: float = 0.0  # [s]: of the first window
-    aliases: Mapping[str, set[str]] = {}  # as of `list_aliases`
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,11 +251,11 @@ class Trial:
         unit, t = self.problem.scene.scales.time, simulation.t
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
-            gains = [s.start for s in simulation.stretches if s.contact == window.gained]
+            gains = [s.start for s in simulation.stretches if s.contact in window.gained]
             gain = min((time for time in gains if time > began), default=math.inf)
             # A phase ends when its contact is made, even if it bounces then.
             makes = simulation.find(EventKind.GAINED)
-            times = (event.time for event in makes if event.contact == window.gained)
+            times = (event.time for event in makes if event.contact in window.gained)
             made = min((time for time in times if time > began), default=gain)
             planned = window.stop + delay
             stop = min(planned, gain, made)
@@ -271,7 +271,7 @@ class Trial:
             if began > t[-1]:
                 # What ends the whole motion may be a little short: that is for the goal to say.
                 if window is not self.windows[-1]:
-                    losses.append((planned, window.phase, window.gained))
+                    losses.append((planned, window.phase, min(window.gained, default="")))
                 break
         if not losses:
             return "", None, None, least
@@ -311,8 +311,8 @@ def make_trial(
             part.number,
             float(starts[part.index + 1]) - begin,
             tuple(part.formation.names),
-            "" if part.until.contact is None else part.until.contact.name,
-            aliases=list_aliases(problem, part),
+            list_gained(problem, part),
+            list_aliases(problem, part),
         )
         for part in problem.phases[first : last + 1]
     )

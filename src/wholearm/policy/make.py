@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
+from ..contacts.contact_limits import list_renamed
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..geometry.tracing import runs_on_curves, split_blocks, trace_phase
@@ -438,8 +439,9 @@ def _trace(
     s = s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length]
     a, b, internal = (np.interp(s, places, value) for value in values)
     touch, begins, passes, end = SETTINGS.touch * problem.scene.scales.speed, float(b[0]), 0.0, None
-    if phase.end is not End.REST and after is not None and b[-1] > touch**2:
-        passes = after.begins / float(b[-1]) if phase.end is End.IMPACT else 1.0
+    impact = phase.end is End.IMPACT and b[-1] > touch**2
+    if after is not None and (impact or phase.end is End.SMOOTH):
+        passes = after.begins / float(b[-1]) if impact else 1.0
         end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
     else:
         b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrival) ** 2)
@@ -449,7 +451,7 @@ def _trace(
         if within is not None:
             return ReferencePiece(curve, *within, share, begins, passes, b)
 
-    beyond = None if after is None or not passes or phase.end is not End.SMOOTH else after.curve
+    beyond = after.curve if after is not None and phase.end is End.SMOOTH else None
 
     def find_rows(motion: PathMotion) -> CurveLimitRows:
         rows = make_rows(curve, s, motion)
@@ -631,6 +633,22 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
     return None if problem.uncertainty is None else problem.ranges
 
 
+def pass_renamed(problem: Problem) -> Problem:
+    """The problem without stops where phases along curves only rename a contact.
+
+    Such an end does not stop the joints: they would go on to well beyond it. Case: hexagon, phase
+    10, which is shorter than that.
+    """
+    phases = list[Phase]()
+    for block in split_blocks(problem):
+        before = phases[-1:]
+        contacts = [phase.formation.contacts for phase in (*before, block[0])]
+        if before and runs_on_curves((*before, *block)) and list_renamed(problem.scene, *contacts):
+            phases[-1] = replace(phases[-1], end=End.SMOOTH)
+        phases += block
+    return replace(problem, phases=tuple(phases))
+
+
 def make_policy(
     problem: Problem,
     plan: Trajectory | Moved,
@@ -681,6 +699,7 @@ def make_policy(
     starts, given, phases = plan.phase_starts, problem.table, problem.phases
     if reserve and planner is not None:
         problem, plan = replan(planner, problem, plan)
+    problem = pass_renamed(problem)
     blocks = split_blocks(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
     pieces = trace_pieces(problem, plan, reserve, widths)
@@ -707,10 +726,10 @@ def make_policy(
                 push = push if hold is None else hold
             table = _tabulate_curve(piece, push)
             tables.append(_join(tables.pop(), table) if goes_on else table)
-            goes_on = bool(piece.passes) and phase.end is End.SMOOTH
+            goes_on = phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
             # The plan goes on in motion there.
-            entry["stops"] = phase.end is not phases[phase.index].end
+            entry["stops"] = phase.end is End.REST is not phases[phase.index].end
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
             if not piece.passes:
                 entry["duration"] += settings.dwell + delay
@@ -734,5 +753,5 @@ def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, f
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
     most = min(SETTINGS.widest / relative, 64.0) if relative > 0 else 64.0
-    pieces = trace_pieces(problem, plan, most, scale_ranges(ranges, most, delay))
+    pieces = trace_pieces(pass_renamed(problem), plan, most, scale_ranges(ranges, most, delay))
     return {index + 1: most * piece.share for index, piece in pieces.items()}

@@ -751,7 +751,7 @@ class FreeRun(Run):
         """Margins at rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1), scaled.
 
         All are affine in the torques: they follow from the steps' forces under three torques. Where
-        it is `decided` that everything rests at present, accelerations there are rounding.
+        it is `decided` that everything rests at present, accelerations and breaches are rounding.
         """
         self.load(self.modes)
         s, at, to = self.s, self.s.inputs, self.s.to
@@ -768,11 +768,12 @@ class FreeRun(Run):
         values[:, 0] += seen[0]
         count = s.rows.cone.stop
         margins, rates = values[:count], values[count:]
-        margins[:, 0] += ROUNDING_FORCE
         creeps = np.vstack([-rates, rates])
-        present = np.abs(creeps @ self.fraction(self.t) ** np.arange(creeps.shape[1]))
-        # Contacts are nearly dependent where two fingers come to rest on each other.
-        creeps[:, 0] += np.maximum(10 * STILL, 2 * present * decided)
+        powers = self.fraction(self.t) ** np.arange(values.shape[1]) * decided
+        # Contacts are nearly dependent where two fingers come to rest on each other, or where the
+        # only one that sticks hardly moves with the hand (hexagon with v0 below finger 2's joint).
+        margins[:, 0] += np.maximum(ROUNDING_FORCE, -2 * margins @ powers)
+        creeps[:, 0] += np.maximum(10 * STILL, 2 * np.abs(creeps @ powers))
         return np.vstack([margins, creeps])
 
     # Motion.

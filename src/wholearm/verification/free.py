@@ -120,11 +120,9 @@ def verify_policy(
     phases, moment = list[FreePhase](), MOMENT * problem.scene.scales.time
     warnings = warn("whole", whole)
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
-        number, start, gained = phase.number, loop.began[phase.number], phase.until.contact
+        number, start = phase.number, loop.began[phase.number]
         stop = loop.began.get(number + 1, float(whole.t[-1]))
-        after = problem.phases[number].formation.contacts if number < count else ()
-        # Beyond a border the gained contact may press as that of another feature.
-        names = {c.name for c in (gained, *after) if c is not None} - set(phase.formation.names)
+        names = list_gained(problem, phase)
         gains = [s.start for s in whole.stretches if s.contact in names and s.start > start]
         losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed, moment))
         reached = number == count or number + 1 in loop.began
@@ -230,6 +228,17 @@ def _find_end(
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
         times = [e.time for e in lost if e.contact in list_leaving(phase, after)]
     return min(times, default=None)
+
+
+def list_gained(problem: Problem, phase: Phase) -> set[str]:
+    """Contacts that a phase ends with, but for those that its own go on as.
+
+    Beyond a border the gained contact may press as that of another feature, as the next phase has.
+    """
+    following = problem.phases[phase.number : phase.number + 1]
+    new = {name for after in following for name in after.formation.names}
+    gained = {phase.until.contact.name} if phase.until.contact is not None else set()
+    return (new | gained).difference(phase.formation.names, *list_aliases(problem, phase).values())
 
 
 def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
