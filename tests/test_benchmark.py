@@ -510,8 +510,8 @@ def phase(number: int, drag: bool = True) -> Instance:
 
 @pytest.mark.parametrize("method", TRIED)
 def test_every_planner_comes_near_the_least_time(method: str) -> None:
-    if not PLANNERS[method].is_installed:
-        pytest.skip(f"{method}: pip install 'wholearm[bench]'")
+    if module := PLANNERS[method].module:
+        pytest.importorskip(module, reason=f"{method}: pip install 'wholearm[bench]'")
     (study, *_) = PLANNERS[method].choices
     instance = phase(4, study != NO_DRAG)
     found = run_planner(instance, method, TRIED[method])

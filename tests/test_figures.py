@@ -50,9 +50,9 @@ from wholearm.planning.result import Plan, Status, describe_plan, load_plan, wri
 from wholearm.results.dwell_record import assemble
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
 from wholearm.viewer.page import (
+    Pushes,
     build_page,
     describe_motion,
-    place_pushes,
     write_chart,
     write_player,
 )
@@ -452,7 +452,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     problem, plan = problem_of(LANDING), plan_of(LANDING)
-    points, normals, forces = place_pushes(problem.scene, plan)
+    points, normals, _, forces, _ = Pushes.of(problem.scene, plan)
     mass, inertia = problem.scene.mass_diagonal[1:3]
     arms = points - plan.q[:, None, :2]
     moments = arms[..., 0] * forces[..., 1] - arms[..., 1] * forces[..., 0]

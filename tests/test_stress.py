@@ -204,11 +204,11 @@ def test_ends_are_found_though_a_joint_turns_far_on_the_way() -> None:
 def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
     problem = tipping()
     (phase,), scene = problem.phases, problem.scene
-    best = find_best(scene, phase, problem.epsilon, problem.start, _ends())
-    assert best.margin > 1e-3 and best.curves > 0
-    assert np.abs(phase.formation.evaluate(best.z, best.z).C).max() < 1e-9
-    assert np.degrees(best.z[-1, 2]) == pytest.approx(9.5, abs=1e-6)
-    assert slow_margin(scene, phase, problem.epsilon, best.z, np.gradient(best.z, axis=0)) > 0
+    margin, z, curves = find_best(scene, phase, problem.epsilon, problem.start, _ends())
+    assert margin > 1e-3 and curves > 0
+    assert np.abs(phase.formation.evaluate(z, z).C).max() < 1e-9
+    assert np.degrees(z[-1, 2]) == pytest.approx(9.5, abs=1e-6)
+    assert slow_margin(scene, phase, problem.epsilon, z, np.gradient(z, axis=0)) > 0
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import statistics
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from itertools import chain, pairwise, product
 from pathlib import Path
+from timeit import Timer
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import casadi as ca
@@ -64,10 +65,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-REPEATS = 3  # largest number of runs that a median is of
-BUDGET = 0.3  # time after which a run is not repeated any more [s]
 SHIFT = 0.01  # shift of the geometric means [s]
-SHORT = 0.05  # time up to which something is done several times over, in about this time [s]
 SOLVED = "solved"
 SIMULATION = FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies of simulators: torques in a few long pieces, and planned torques in eighty."""
@@ -109,11 +107,8 @@ def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance,
     return tuple(instances.values())
 
 
-class PeerPlan(NamedTuple):
-    """What a planner has found for one phase; a text takes its place that says why it has not."""
-
-    duration: float  # [s]
-    torque: TorqueProfile
+Plan = TorqueProfile | str
+"""The torques that a planner has found for one phase, or why it has not."""
 
 
 def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
@@ -141,14 +136,9 @@ class Method(NamedTuple):
     choices: dict[str, tuple[str, ...]]  # settings that are measured, by study
     module: str = ""  # what has to be installed, if anything
 
-    @property
-    def is_installed(self) -> bool:
-        """Whether there is what it needs."""
-        return not self.module or find_spec(self.module) is not None
 
-
-class Median(NamedTuple):
-    """The runs of one setting: medians of their times [s], and the worst of the rest."""
+class Run(NamedTuple):
+    """What one setting takes, and what comes of it."""
 
     build: float  # build, solve [s]: time to build, and to simulate or solve
     solve: float
@@ -161,43 +151,25 @@ class Median(NamedTuple):
 def measure(
     build: Callable[[], Callable[[], _Answer]],
     judge: Callable[[_Answer], tuple[tuple[float, ...], str]],
-) -> Median:
-    """Build and run as often as the time allows; `judge` gives the errors and the outcome."""
-    builds, solves, answers = [], [], []
+) -> Run:
+    """Build and run; `judge` gives the errors and the outcome."""
     with warnings.catch_warnings():
         # Warnings of peers are not ours.
         warnings.simplefilter("ignore")
-        began = time.process_time()
-        for _ in range(REPEATS):
-            built, run = _time(build)
-            took, answer = _time(run)
-            builds.append(built)
-            solves.append(took)
-            answers.append(answer)
-            if time.process_time() - began > BUDGET:
-                break
-    errors, outcomes = zip(*map(judge, answers), strict=True)
-    worst = tuple(max(column, key=abs) for column in zip(*errors, strict=True))
-    outcome = next((outcome for outcome in outcomes if outcome != SOLVED), SOLVED)
-    return Median(statistics.median(builds), statistics.median(solves), worst, outcome)
+        built, run = _time(build)
+        took, answer = _time(run)
+    return Run(built, took, *judge(answer))
 
 
 def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
-    """Processor time that something takes [s], and its answer.
+    """Mean processor time of as many runs as take 0.2 s, one at least [s], and the last answer.
 
-    Other work on the machine hardly changes it. What is too short for its clock is done several
-    times over.
+    Other work on the machine hardly changes it.
     """
-    wall, processor = time.perf_counter(), time.process_time()
-    answer = work()
-    wall, processor = time.perf_counter() - wall, time.process_time() - processor
-    if wall > SHORT:
-        return processor, answer
-    count = math.ceil(SHORT / max(wall, SHORT / 200))
-    processor = time.process_time()
-    for _ in range(count):
-        work()
-    return (time.process_time() - processor) / count, answer
+    answers = deque[_Answer](maxlen=1)
+    timer = Timer(lambda: answers.append(work()), timer=time.process_time)
+    count, seconds = timer.autorange()
+    return seconds / count, answers[0]
 
 
 def find_mean(seconds: Sequence[float]) -> float:
@@ -373,7 +345,7 @@ SIMULATORS = {
 }
 
 
-def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Median | None:
+def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Run | None:
     """Run one setting of one simulator on one phase; None if the phase has no course."""
     course = make_course(instance, study)
     if course is None:
@@ -410,7 +382,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     return Course(problem, torque, spans, end)
 
 
-def check_plan(instance: Instance, plan: PeerPlan | str) -> tuple[float, float, str]:
+def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
     """Replay a plan.
 
     Returns
@@ -423,11 +395,11 @@ def check_plan(instance: Instance, plan: PeerPlan | str) -> tuple[float, float, 
         return math.nan, math.nan, plan
     problem, curve = instance.problem, instance.curve
     reversals = len(curve.segments) - 1
-    state, _, least = integrate(problem, plan.torque, curve, reversals, 1e-10)
+    state, _, least = integrate(problem, plan, curve, reversals, 1e-10)
     end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
     limit = problem.scene.torque_limit
     places = np.cos(np.linspace(0.0, np.pi, 9))
-    excess = float((np.abs(plan.torque.at_places(places)) / limit[:, None] - 1).max())
+    excess = float((np.abs(plan.at_places(places)) / limit[:, None] - 1).max())
     missing = (problem.epsilon - least) / problem.scene.scales.force
     violation = max(0.0, excess, missing)
     tests = (
@@ -453,14 +425,14 @@ def build_plant(formation: Formation) -> Expression:
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
 
 
-def run_planner(instance: Instance, method: str, setting: str) -> Median:
+def run_planner(instance: Instance, method: str, setting: str) -> Run:
     """Run one setting of one planner on one phase, and check its plans."""
     if module := PLANNERS[method].module:
         # No timing is to include the import.
         __import__(module)
     least = find_least_time(instance)
 
-    def judge(plan: PeerPlan | str) -> tuple[tuple[float, ...], str]:
+    def judge(plan: Plan) -> tuple[tuple[float, ...], str]:
         end, violation, outcome = check_plan(instance, plan)
         error = math.nan if isinstance(plan, str) else plan.duration / least - 1
         return (error, end, violation), outcome
@@ -481,32 +453,22 @@ def find_least_time(instance: Instance) -> float:
     return plan_path(curve, epsilon, PlanOptions(accuracy=1e-7), 1).motion.duration
 
 
-def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Ours along the curve; its NLP is built anew."""
     curve, epsilon = instance.curve, instance.problem.epsilon
     options = PlanOptions(accuracy=float(setting))
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data), len(data.grid.steps), Objective.TIME)
-
-    def run() -> PeerPlan:
-        plan = plan_path(curve, epsilon, options, 1)
-        return PeerPlan(plan.motion.duration, plan.torque)
-
-    return run
+    return lambda: plan_path(curve, epsilon, options, 1).torque
 
 
-def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Ours over time; a setting is the number of intervals, and the degree."""
     intervals, degree = map(int, setting.split(" x "))
     options = PlanOptions(time_intervals=intervals, degree=degree, transcription="time")
     problem = instance.problem
-
-    def run() -> PeerPlan:
-        (plan,) = plan_phases(problem, problem.phases, problem.start, options)
-        return PeerPlan(plan.motion.duration, plan.torque)
-
-    return run
+    return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
 
 
 def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
@@ -517,7 +479,7 @@ def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[Path
     return forces, PathLimits.of(limits, forces, point.z_s[:, 3:])
 
 
-def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan | str]:
+def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
     import toppra
     from toppra.constraint import DiscretizationType, LinearConstraint
@@ -554,7 +516,7 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan | st
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
     planner = toppra.algorithm.TOPPRA([Limits()], path, gridpoints=grid, **options)
 
-    def run() -> PeerPlan | str:
+    def run() -> Plan:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
         if speeds is None or not np.isfinite(speeds).all():
             return "no feasible parametrisation"
@@ -563,7 +525,7 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan | st
     return run
 
 
-def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
+def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
     """Torques by inverse dynamics, with the internal force linear between grid points.
 
     The two points beside a reversal become one, with a step of the torques.
@@ -594,11 +556,10 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         forces, _ = _limit(instance, grid[k] + run, owner[k])
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
 
-    profile = TorqueProfile.fit(times, torque, 4)
-    return PeerPlan(float(times[-1]), profile)
+    return TorqueProfile.fit(times, torque, 4)
 
 
-def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan | str]:
+def build_yapss(instance: Instance, setting: str) -> Callable[[], Plan]:
     """A phase for every stretch, with contact forces among the controls, on Legendre-Gauss points.
 
     The slow motion is the first guess.
@@ -686,7 +647,7 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
         ocp.functions.discrete = discrete
 
 
-def _read(solution: Any) -> PeerPlan | str:
+def _read(solution: Any) -> Plan:
     """The torques linear between collocation points: their polynomials swing wide in between."""
     if solution.nlp_info.ipopt_status != 0:
         return str(solution.nlp_info.ipopt_status_message)
@@ -695,8 +656,7 @@ def _read(solution: Any) -> PeerPlan | str:
         tau = np.asarray(phase.control)[:2].T
         times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
         rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
-    torque = TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
-    return PeerPlan(float(times[-1][-1]), torque)
+    return TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
@@ -728,14 +688,13 @@ PLANNERS = {
 
 
 METHODS = SIMULATORS | PLANNERS  # all methods by name, in the order of the tables
-MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
+MARKERS = "osD^"  # markers of the methods of a panel
 
 
 INTRODUCTION = f"""\
-Times are medians of processor time over up to {REPEATS} runs (one where that takes over {BUDGET:g}
-s) in one thread; what takes less than {SHORT:g} s is averaged over that time. Means are geometric
-ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each with the setting that
-reaches the error soonest; what does not reach it counts with the time limit.
+Times are those of the processor in one thread; what takes less than 0.2 s is averaged over that
+time. Means are geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each
+with the setting that reaches the error soonest; what does not reach it counts with the time limit.
 
 Phases whose slow motion would lose a contact have no few pieces of torque, and where a method was
 not run on a phase, ours does not count there either.
@@ -754,10 +713,12 @@ TARGETS = dict.fromkeys(SIMULATION, (1e-6, 1e-9, 1e-11)) | dict.fromkeys(
 
 
 def _group(rows: Sequence[Row], study: str) -> dict[str, list[Row]]:
-    """Rows of a study by method, in the order of methods."""
-    mine = [row for row in rows if row["study"] == study]
-    groups = {name: [row for row in mine if row["method"] == name] for name in METHODS}
-    return {name: group for name, group in groups.items() if group}
+    """Rows of a study by method, in the order of methods, as cases are listed."""
+    groups = dict[str, list[Row]]()
+    for row in rows:
+        if row["study"] == study:
+            groups.setdefault(row["method"], []).append(row)
+    return groups
 
 
 def _find_times(rows: Sequence[Row], target: float, count: int | None) -> dict[str, float]:
@@ -816,8 +777,7 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
             full.append(all(row["outcome"] == SOLVED for row in group))
         if not points:
             continue
-        look: Any = {"color": PALETTE[index % len(PALETTE)], "marker": MARKERS[index]}
-        look |= {"linestyle": "-" if index < len(PALETTE) else "--", "markersize": 5}
+        look: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
         axes.plot(*zip(*points, strict=True), label=method, **look)
         hollow = [point for point, whole in zip(points, full, strict=True) if not whole]
         if hollow:
@@ -859,7 +819,8 @@ class Precision(Study):
                 raise InputError("", "--peers", text)
         for study, (method, peer) in product(SIMULATION + PLANNING, METHODS.items()):
             asked = method in (options.peers or METHODS)
-            if asked and study in peer.choices and peer.is_installed:
+            is_installed = not peer.module or find_spec(peer.module)
+            if asked and study in peer.choices and is_installed:
                 phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
                 yield from product([study], phases, [method], peer.choices[study], [files])
 
@@ -873,22 +834,20 @@ class Precision(Study):
         instances = list_instances(files, study != NO_DRAG)
         instance = next(instance for instance in instances if instance.name == name)
         if study in PLANNING:
-            median: Median | None = run_planner(instance, method, setting)
+            measured: Run | None = run_planner(instance, method, setting)
         else:
-            median = run_simulator(instance, study, method, setting)
+            measured = run_simulator(instance, study, method, setting)
         row = dict(zip(self.columns[:4], case, strict=False))
-        return row if median is None else row | median._asdict()
+        return row if measured is None else row | measured._asdict()
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """All tables."""
         measured = [row for row in rows if "errors" in row]
         parts: list[str | Table] = [INTRODUCTION]
-        for study in SIMULATION:
-            parts += _format_targets(measured, study, "", None, options.limit)
-        for study in PLANNING:
-            title = ", by the error of the phase time"
-            parts += _format_targets(measured, study, title, 1, options.limit)
-            parts += _format_targets(measured, study, ", by all three errors", None, options.limit)
+        counts = {", by the error of the phase time": 1, ", by all three errors": None}
+        for study in SIMULATION + PLANNING:
+            for title, count in counts.items() if study in PLANNING else [("", None)]:
+                parts += _format_targets(measured, study, title, count, options.limit)
         table = [(name, method.settings) for name, method in METHODS.items()]
         return [*parts, "## Settings", Table(["method", "settings"], table)], []
 

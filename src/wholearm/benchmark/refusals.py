@@ -110,6 +110,7 @@ def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
 def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     """Integrate the unit tangent up to the first event."""
     size, until, scale = scene.scales.length, phase.until, np.sqrt(weights(scene))
+    near = OVERLAP * size
 
     def tangents(z: Array) -> Array:
         # Cofactors of the four rows: unlike null vectors of an SVD they keep their sense.
@@ -119,13 +120,8 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
         size = np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
         return np.asarray(tangent / size / scale)
 
-    def find_room(z: Array) -> dict[str, float]:
-        touches = {f"{n} leaves": locate(scene, n, z[None]) for n in phase.formation.names}
-        room = {name: float(gap[0]) for name, gap in clearances(scene, z[None]).items()}
-        return room | {name: float(min(t.low[0], t.high[0])) for name, t in touches.items()}
-
     def overlap(_: float, z: Array) -> float:
-        return min(find_room(z).values()) + OVERLAP * size
+        return float(min(room[0] for room in find_room(scene, phase, z[None]).values())) + near
 
     def end(_: float, z: Array) -> float:
         if until.contact is not None or until.value is None:
@@ -147,11 +143,19 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     text = "nothing happens" if run.status == 0 else "the contacts become dependent"
     met = run.status == 1 and len(run.t_events[1]) > 0
     if run.status == 1 and not met:
-        text = ", ".join(k for k, room in find_room(last).items() if room < -OVERLAP * size / 2)
+        rooms = find_room(scene, phase, last[None])
+        text = ", ".join(name for name, room in rooms.items() if room[0] < -near / 2)
         if until.contact is not None:
-            touch, near = locate(scene, until.contact.name, last[None]), 1e-5 * size
-            met = bool(max(abs(touch.gap[0]), -touch.low[0], -touch.high[0]) <= near)
+            touch = locate(scene, until.contact.name, last[None])
+            met = bool(max(abs(touch.gap[0]), -touch.low[0], -touch.high[0]) <= 10 * near)
     return Trace(run.sol, float(run.t[-1]), last, tangents, str(until) if met else text, met)
+
+
+def find_room(scene: Scene, phase: Phase, z: Array) -> dict[str, Array]:
+    """Room of n configurations to overlaps, and of contacts to the ends of features, (n,) [m]."""
+    touches = {f"{name} leaves": locate(scene, name, z) for name in phase.formation.names}
+    ends = {name: np.minimum(touch.low, touch.high) for name, touch in touches.items()}
+    return clearances(scene, z) | ends
 
 
 def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
@@ -599,21 +603,13 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
     if max(stopped) < -CLEAR:
         reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {max(stopped):.3g}"
         return Verdict("confirmed", reason)
-    best = find_best(scene, phase, epsilon, z, ends)
-    text = f"{at}: of {best.curves} curves to {len(ends)} places the best has {best.margin:.3g}"
-    if best.margin > CLEAR:
-        unique = uniqueness_ratio(scene, phase, best.z, np.gradient(best.z, axis=0)).min()
+    margin, curve, count = find_best(scene, phase, epsilon, z, ends)
+    text = f"{at}: of {count} curves to {len(ends)} places the best has {margin:.3g}"
+    if margin > CLEAR:
+        unique = uniqueness_ratio(scene, phase, curve, np.gradient(curve, axis=0)).min()
         return Verdict("close" if unique < UNIQUENESS.default else "refuted", text)
     # Where the best of many curves misses limits by so much, surely none keeps them.
-    return Verdict("confirmed" if best.curves and best.margin < -0.02 else "close", text)
-
-
-class Best(NamedTuple):
-    """The best of many curves."""
-
-    margin: float  # as of `fast_margin`
-    z: Array  # (n, 5): the curve
-    curves: int  # curves that were looked at
+    return Verdict("confirmed" if count and margin < -0.02 else "close", text)
 
 
 def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
@@ -648,33 +644,33 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     return points[inside(scene, phase, points)]
 
 
-def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array) -> Best:
-    """Look for the curve from `z` to one of `ends` along which a motion keeps limits best.
+def find_best(
+    scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array
+) -> tuple[float, Array, int]:
+    """The largest `fast_margin` of curves from `z` to `ends`, the curve, (n, 5), and their number.
 
     The search stops at a curve with the margin `CLEAR`.
     """
     rng = np.random.default_rng(0)
     start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
     goals = ends[:, [0, 2]]
-
     # Control points of cubic curves, shape (n, 4, 2): straight ones, and 400 that bend.
     share = np.linspace(0, 1, 4)[:, None]
     straight = share * (goals - start)[:, None] + start
     drawn = share * (goals[rng.integers(len(goals), size=400)] - start)[:, None] + start
     width = 0.5 * rng.uniform(size=(400, 1, 1)) * size
     drawn[:, 1:3] += width * rng.normal(size=(400, 2, 2))
-    best = Best(-np.inf, z[None], 0)
+    margins, tried = [-np.inf], [z[None]]
     for controls, most in ((straight, len(straight)), (drawn, 40)):
         curves = bend(scene, phase, z, controls)
         stays = inside(scene, phase, curves.reshape(-1, 5)).reshape(len(curves), -1)
         kept = curves[stays.all(axis=1)][:most]
-        margins = [_find_margin(scene, phase, epsilon, curve) for curve in kept]
-        best = best._replace(curves=best.curves + len(kept))
-        if max(margins, default=-np.inf) > best.margin:
-            best = best._replace(margin=max(margins), z=kept[int(np.argmax(margins))])
-        if best.margin > CLEAR:
+        margins += [_find_margin(scene, phase, epsilon, curve) for curve in kept]
+        tried += [*kept]
+        if max(margins) > CLEAR:
             break
-    return best
+    best = int(np.argmax(margins))
+    return margins[best], tried[best], len(tried) - 1
 
 
 def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
@@ -709,14 +705,10 @@ def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
 
     Up to 1e-4 of the radius of gyration.
     """
-    least = 1e-4 * scene.scales.length
-    good = np.isfinite(z).all(axis=1)
-    for name in phase.formation.names:
-        touch = locate(scene, name, z)
-        good &= (np.abs(touch.gap) < 1e-8 * scene.scales.length) & (touch.low > -least)
-        good &= touch.high > -least
-    for gap in clearances(scene, z).values():
-        good &= gap > -least
+    gaps, _ = constrain(scene, phase, z)
+    good = np.isfinite(z).all(axis=1) & (np.abs(gaps) < 1e-8 * scene.scales.length).all(axis=1)
+    for room in find_room(scene, phase, z).values():
+        good &= room > -1e-4 * scene.scales.length
     return np.asarray(good)
 
 

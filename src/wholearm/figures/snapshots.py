@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -19,17 +18,16 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.sharing import exclusive
-from ..contacts.elemental import build_features, build_geometry, parse_contact
+from ..contacts.elemental import parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
+from ..verification.newton_euler import locate
 from .style import BODY, FINGERS, INK, PALM, Styles, add_line, count_decimals, inset, write
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
 CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that gives the scale [in]
 
 
-@exclusive
 def draw_snapshot(
     axes: Axes,
     scene: Scene,
@@ -51,12 +49,10 @@ def draw_snapshot(
     ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
     artists = [draw_palm(axes, scene, ends.min(), ends.max()), *draw_bodies(axes, scene, z)]
     draw_joints(axes, scene)
-    places = [build_geometry(parse_contact(name, scene), scene).point for name in contacts]
-    place = ca.Function("points", [build_features(scene).z], [ca.horzcat(*places)])
-    for name, point in zip(contacts, place(z).full().T, strict=True):
+    for name in contacts:
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
-        artists += axes.plot(*point, marker, ms=6.5, **look)
+        artists += axes.plot(*locate(scene, name, z[None]).point.T, marker, ms=6.5, **look)
     box = measure_box(scene, z[None]) if box is None else box
     axes.set(xlim=box[:, 0], ylim=box[:, 1])
     scale = measure_scale(axes)

@@ -36,25 +36,25 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
     return trajectory.torque, trajectory
 
 
-def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
-    """The motion of a plan, and the problem with its phases where that has goals instead.
-
-    InputError if torques alone are given, or the plan ends elsewhere than at the last goal.
-    """
-    problem, _, trajectory = adopt_torques(problem, plan)
-    if trajectory is None:
-        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
-    return problem, trajectory
-
-
 def adopt_torques(
     problem: Problem, what: Torques
 ) -> tuple[Problem, TorqueProfile, Trajectory | None]:
-    """The problem as of `adopt_motion`, and the torques and motion as of `narrow`."""
+    """The problem with the phases of a plan, if it has goals, and torques and motion of that.
+
+    InputError if the plan ends elsewhere than at the last goal.
+    """
     torque, trajectory = narrow(what)
     if trajectory is not None:
         problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1])
     return problem, torque, trajectory
+
+
+def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
+    """Problem and motion as of `adopt_torques`; an `InputError` if torques alone are given."""
+    problem, _, trajectory = adopt_torques(problem, plan)
+    if trajectory is None:
+        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    return problem, trajectory
 
 
 def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:

@@ -30,13 +30,11 @@ from .trajectory import Motion, Samples, Trajectory, split_motion
 class TorqueChange:
     """How torques change."""
 
-    before: Array  # before, after (2,) [N m]:
-    after: Array
+    before: Array  # (2,) [N m]
+    after: Array  # (2,) [N m]
     times: Array  # (n + 1,) [s]: from 0 on
-    # levels, rates (n + 1,) and (n,) [-], [1/s]: sigma at these times, and its rate of change just
-    # after them
-    levels: Array
-    rates: Array
+    levels: Array  # (n + 1,): sigma at these times
+    rates: Array  # (n,) [1/s]: its rate of change just after them
     decays: Array  # (n,) [1/s]: how fast that decays
 
     @property
@@ -121,19 +119,13 @@ class Settling(NamedTuple):
     phase: int  # its number
     duration: float  # [s]: zero where no torques hold it
     tau: tuple[float, float]  # [N m]
-    # the least margin of balance, normal forces and accelerations, over what is ample
-    margin: float
+    margin: float  # least of balance, normal forces and accelerations, over what is ample
     contact: str = ""  # what closes if it is still open; empty if nothing is gained there
     gap: float = 0.0  # [m]: from which on that was simulated
-    # [s]: from when on everything was closed then, but for a hundredth of the gap; None if it was
-    # not
-    closes: float | None = None
+    closes: float | None = None  # [s]: when all was closed, but for a hundredth of the gap
     left: float = 0.0  # [m]: largest gap at the end
-    # [m/s]: at most, with which the contact is reached, if all others stay closed till then; else
-    # zero
-    speed: float = 0.0
-    # contacts that would have to pull in the impact of that, and part for a moment
-    parts: tuple[str, ...] = ()
+    speed: float = 0.0  # [m/s]: most with which the contact is reached; 0 if others open before
+    parts: tuple[str, ...] = ()  # contacts that would have to pull in that impact, and part
     warning: str = ""  # what the torques do not do; empty if nothing
 
 
@@ -144,8 +136,7 @@ class SettledMotion:
     motion: Motion
     held: float  # [s]: how long, with the time in which torques change into these
     tau: Array  # (2,) [N m]
-    # where torques may not step, how they change from those of the motion's end
-    change: TorqueChange | None = None
+    change: TorqueChange | None = None  # from those of the motion's end, where none may step
 
     @property
     def ramp(self) -> float:

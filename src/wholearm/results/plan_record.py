@@ -87,9 +87,8 @@ class Transition(NamedTuple):
     least_impulse: float  # [N s per m/s]: for unit speed before
     least_impulse_contact: str
     speed: float  # [m/s]: before; zero if the motion stops there
-    # [s], [(N m)^2 s] or [N]: how much better the objective is than with a stop instead, of the
-    # phases that are planned together: less time or effort, or more margin. NaN if the impact is
-    # not possible, or there is no plan with a stop.
+    # [s], [(N m)^2 s] or [N]: how much better than with a stop the objective is of phases planned
+    # together; NaN if the impact is not possible, or there is no plan with a stop
     saves: float
 
     @property
@@ -103,14 +102,11 @@ class RangeFigures(NamedTuple):
 
     radii: Mapping[str, float]  # half widths of the ranges by name, as they were planned with
     nominal: float  # the objective without ranges
-    # factor on the problem's ranges up to which there is a plan; None if it was not looked for
-    largest: float | None = None
+    largest: float | None = None  # factor on the ranges up to which there is a plan, if looked for
     # the same for each phase, planned with those that impacts join it to; None in the time domain
     phases: tuple[float | None, ...] = ()
-    # whether the factor is as large as ranges make sense, and no limit stands against a larger one
-    capped: bool = False
-    # numbers of phases whose start friction may hold, somewhere within the ranges
-    held: tuple[int, ...] = ()
+    capped: bool = False  # whether the factor is as large as ranges make sense
+    held: tuple[int, ...] = ()  # numbers of phases whose start friction may hold within the ranges
 
 
 class LeastForce(NamedTuple):
@@ -139,6 +135,4 @@ class ReplayFigures(NamedTuple):
     phases: tuple[ReplayedPhase, ...]
     residual: float  # what the samples leave of the equations of motion, in the scene's own units
     steps: int  # of the simulation
-    # how many replays were made before one held, that one included; None where a file of an earlier
-    # version does not say
-    simulations: int | None = None
+    simulations: int | None = None  # replays up to the one that held; None in earlier versions

@@ -17,7 +17,7 @@ class ForceAt(NamedTuple):
     """A contact's forces at an instant, and what torques change of them."""
 
     contact: str
-    c_n: float  # c_n, c_t [N]: naN where they are not determined, at rest
+    c_n: float  # c_n, c_t [N]: NaN where they are not determined, at rest
     c_t: float
     per_tau: tuple[float, float]  # [N/(N m)]: d c_n / d tau_1 and d c_n / d tau_2, at that state
 
@@ -25,19 +25,15 @@ class ForceAt(NamedTuple):
 class TorqueAdvice(NamedTuple):
     """A change of the torques that mends a loss."""
 
-    # change, to [N m]: by how much both torques change, and what they then are
-    change: tuple[float, float]
-    to: tuple[float, float]
+    change: tuple[float, float]  # of both torques [N m]
+    to: tuple[float, float]  # what they then are [N m]
     but: str = ""  # what else it spoils, by name; empty if every limit is kept
     holds: bool = False  # whether the object then stays at rest
 
     def to_text(self) -> str:
         """The change in words."""
-        parts = [
-            f"tau_{k + 1} {change:+.3g} N m (to {to:.4g})"
-            for k, (change, to) in enumerate(zip(self.change, self.to, strict=True))
-            if change
-        ]
+        pairs = enumerate(zip(self.change, self.to, strict=True), start=1)
+        parts = (f"tau_{k} {by:+.3g} N m (to {to:.4g})" for k, (by, to) in pairs if by)
         text = " with ".join(parts)
         if self.but:
             return f"{text} would, but {self.but}"
@@ -51,15 +47,12 @@ class Loss(NamedTuple):
     contact: str
     kind: str  # {"lost", "slips", "thin"}
     time: float  # [s]
-    # whether the object was at rest; forces are those with which it would start to move
-    at_rest: bool
+    at_rest: bool  # whether it was; then forces are those with which it would start to move
     forces: tuple[ForceAt, ...]  # of every contact of the formation
     # [m/s^2 or rad/s^2]: acceleration towards the end of the phase, and what 1 N m of tau_1 and of
-    # tau_2 adds to it; empty for a phase that ends by a release, and where forces are not
-    # determined
+    # tau_2 adds to it; empty for a release, and where forces are not determined
     closing: tuple[float, ...]
-    # of one torque alone, or where that spoils something of both, the best first
-    changes: tuple[TorqueAdvice, ...]
+    changes: tuple[TorqueAdvice, ...]  # of one torque, or if that spoils something of both
 
     def to_text(self) -> str:
         """What would mend it, in a sentence."""
@@ -81,9 +74,7 @@ class Approach(NamedTuple):
     unit: str  # {"m", "rad"}
     time: float  # [s]: when
     rate: float  # [m/s or rad/s]: how fast the distance was closing then
-    # [s]: when the motion in this phase turned back: from closing that distance to opening it, or
-    # the other way
-    turns: tuple[float, ...]
+    turns: tuple[float, ...]  # [s]: when the motion turned back in this phase
 
     def to_text(self) -> str:
         """All of it in a sentence."""
@@ -99,8 +90,7 @@ class TuningHelp(NamedTuple):
     """What helps to tune torques."""
 
     losses: tuple[Loss, ...] = ()  # those that end the replay first
-    # none if the goal is reached, or the last phase ends by a release
-    approach: Approach | None = None
+    approach: Approach | None = None  # None if the goal is reached, or the last end is a release
 
 
 _UNIQUENESS = {
@@ -136,16 +126,18 @@ class ContactMargin(NamedTuple):
     """The least normal force of one contact in one phase."""
 
     contact: str
-    least: float  # [N]: naN if the contact was never seen moving
+    least: float  # [N]: NaN if the contact was never seen moving
     time: float  # [s]: when
     margin: float  # [N]: least - epsilon
 
 
 class UniquenessMargin(NamedTuple):
-    """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`)."""
+    """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`).
 
-    # principal minor of the contact matrix K over that without friction: 1 without friction, and
-    # contact forces are the only ones where it is positive
+    A principal minor of the contact matrix K over that without friction: forces are the only ones
+    where all are positive.
+    """
+
     value: float
     contacts: str  # whose minor it is, with the modes of those that do not slide
     time: float  # [s]: when
@@ -183,20 +175,15 @@ class PhaseReport(NamedTuple):
     contacts: tuple[ContactMargin, ...]
     rolling: tuple[SlipMargin, ...]  # of the contacts that roll
     arrival: float | None  # [s]: when its end was reached, None if it was not
-    # [m/s or rad/s]: how fast the distance to the end was closing then; None for a release
-    arrival_rate: float | None
+    arrival_rate: float | None  # [m/s or rad/s] towards the end then; None for a release
     # [m/s]: the largest speed left at an end at rest, angular ones times the scene's length; None
     # where the phase ends otherwise, or was not ended
     end_speed: float | None
-    # none if there was no impact; one that is planned for may have been a stop
-    impact: LeastImpulse | None
-    # end_deviation, deviation: from the plan, at the end of the phase and at worst; None without a
-    # plan
-    end_deviation: Deviation | None
-    deviation: Deviation | None
-    uniqueness_margin: UniquenessMargin | None = None  # none if nothing was seen moving
-    # [s]: for how long friction could have held everything at rest; None if it did not begin so
-    wedged: float | None = None
+    impact: LeastImpulse | None  # None without one, or if what was planned for was a stop
+    end_deviation: Deviation | None  # from the plan at the end of the phase; None without a plan
+    deviation: Deviation | None  # and at worst
+    uniqueness_margin: UniquenessMargin | None = None  # None if nothing was seen moving
+    wedged: float | None = None  # [s]: how long friction could have held it; None if not at rest
 
 
 class ModeChange(NamedTuple):
@@ -213,9 +200,7 @@ class ReducedState(NamedTuple):
 
     time: float  # [s]
     phase: int  # number of the phase
-    # [kg m^2]: inertia at the first joint; its sign depends on what friction makes of the
-    # elimination
-    Phi_1: float
+    Phi_1: float  # [kg m^2]: inertia at the first joint, of either sign with friction
     Phi_2: float  # [N m s]: velocity terms over theta_1'
     Phi_3: float  # [N m]: gravity, dry friction and torques
     theta_1_dot: float  # [rad/s]
@@ -240,12 +225,10 @@ class EnergyBalance(NamedTuple):
     work: float  # of the torques
     kinetic: float  # kinetic, potential: changes
     potential: float
-    # viscous, dry, contact, impact: losses: viscous and dry joint friction, sliding, contacts
-    # gained at a speed
-    viscous: float
+    viscous: float  # viscous, dry, contact, impact: losses
     dry: float
-    contact: float
-    impact: float
+    contact: float  # by sliding
+    impact: float  # by contacts gained at a speed
     residual: float  # what the equations leave unexplained
     relative: float  # the residual over the sum of all magnitudes
 
@@ -258,20 +241,17 @@ class Report(Result):
     epsilon: float  # [N]
     outcome: str  # how the replay ended, in one sentence
     reached: bool  # whether the goal was reached
-    # [m or rad]: distance to the end of the last phase entered, NaN if that is a release
-    missed_by: float
-    # why the torques are not good, the most important first, empty if they are
-    failures: tuple[str, ...]
+    missed_by: float  # [m or rad]: distance to the last end entered, NaN if that is a release
+    failures: tuple[str, ...]  # why the torques are not good, the most important first
     failed_phase: int | None  # number of the phase that the first of them is about
     warnings: tuple[str, ...]  # what is not asked for but worth knowing
     phases: tuple[PhaseReport, ...]  # those entered
     energy: EnergyBalance
-    finger_gap: FingerGap | None  # none if the fingers lie in different planes
+    finger_gap: FingerGap | None  # None if the fingers lie in different planes
     tolerance: float
     steps: int  # of the simulation
     changes: tuple[ModeChange, ...] = ()  # in the order of time
-    # the paper's scalar equation along the replay, if that was asked for
-    reduced: tuple[ReducedState, ...] = ()
+    reduced: tuple[ReducedState, ...] = ()  # along the replay, if that was asked for
     help: TuningHelp = field(default_factory=TuningHelp)  # what helps to tune the torques
     replay: Moved | None = field(default=None, repr=False, compare=False)  # what is reported on
 
@@ -335,9 +315,7 @@ class Report(Result):
     def _list_losses(self, force: str) -> Table:
         """Forces where contacts are lost or slip, and what torques change of them."""
         rows: list[Sequence[object]] = []
-        for loss in self.help.losses:
-            if loss.kind == "thin":
-                continue
+        for loss in (loss for loss in self.help.losses if loss.kind != "thin"):
             for at in loss.forces:
                 rows.append((loss.time, f"c_n of {at.contact}", at.c_n, at.c_t, *at.per_tau))
             if loss.closing:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TextIO
@@ -30,10 +30,8 @@ MOST = 1e30
 class TorqueProfile:
     """Piecewise-polynomial joint torques."""
 
-    # (k + 1,) [s]: strictly increasing. The torque may step at a break and is smooth between two.
-    breaks: Array
-    # (k, 2, d + 1) [N m]: ascending powers of x in [-1, 1], x = (2 t - t_k - t_k+1) / (t_k+1 - t_k)
-    # on piece k
+    breaks: Array  # (k + 1,) [s]: strictly increasing. The torque is smooth between two.
+    # (k, 2, d + 1) [N m]: ascending powers of x = (2 t - t_k - t_k+1) / (t_k+1 - t_k) on piece k
     coefficients: Array
 
     def __repr__(self) -> str:
@@ -50,8 +48,7 @@ class TorqueProfile:
         Before the first break and after the last one the torque of that end holds.
         """
         t = np.clip(t, self.breaks[0], self.breaks[-1])
-        piece = np.searchsorted(self.breaks, t, side="right") - 1
-        piece = np.minimum(piece, len(self.coefficients) - 1)
+        piece = np.searchsorted(self.breaks[1:-1], t, side="right")
         start, stop = self.breaks[piece], self.breaks[piece + 1]
         x = (2 * t - start - stop) / (stop - start)
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
@@ -169,10 +166,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
 
 
 def read_notes(path: str) -> dict[str, str]:
-    """What comments ``# key = value`` of a CSV file say, by their keys.
-
-    InputError if the file cannot be read.
-    """
+    """What comments ``# key = value`` of a CSV file say; an `InputError` if it cannot be read."""
     with _open(path) as stream:
         comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
     return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
@@ -193,11 +187,9 @@ def _open(path: str) -> Iterator[TextIO]:
 def _read_row(path: str, line: int, row: list[str], where: Mapping[str, int]) -> list[float]:
     values = []
     for column, index in where.items():
-        text = row[index].strip() if index < len(row) else ""
-        try:
+        text, value = row[index].strip() if index < len(row) else "", math.nan
+        with suppress(ValueError):
             value = float(text)
-        except ValueError:
-            value = math.nan
         if not math.isfinite(value):
             raise InputError(str(path), column, f"{text!r} on line {line} is not a finite number")
         if abs(value) > MOST:
@@ -216,19 +208,15 @@ def place_rows(
     `error`, relative to the largest torque, is what the lines may miss. They keep a rate limit,
     (2,) [N m/s], if the torques do.
     """
-    peak = np.abs(torque.at_places(_PLACES)).max(axis=(0, 2))
+    peak, breaks = np.abs(torque.at_places(_PLACES)).max(axis=(0, 2)), torque.breaks
     largest = float(peak.max())
     if largest == 0.0:
-        ends = torque.breaks[[0, -1]]
-        return np.column_stack([ends, np.zeros((2, 2))])
+        return np.column_stack([breaks[[0, -1]], np.zeros((2, 2))])
     knots = _divide(torque, error * largest)
-    breaks = torque.breaks
     steps = breaks[1:-1][np.abs(torque.jumps).max(axis=1) > 1e-6 * largest]
-    ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
-    at = np.searchsorted(knots, ends)
+    at = np.searchsorted(knots, [breaks[0], *steps, breaks[-1]])
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]
-    parts = [np.column_stack([part, _fit_lines(torque, part)]) for part in stretches]
-    rows = np.concatenate(parts)
+    rows = np.concatenate([np.column_stack([k, _fit_lines(torque, k)]) for k in stretches])
     # Lines through a bend miss it on both sides; no limit is to be missed for that.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)
@@ -262,10 +250,7 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
 
 
 def require_sampling(rate: object, interpolation: str) -> float:
-    """The rate [Hz] as a number, if it and the interpolation are allowed.
-
-    InputError if they are not.
-    """
+    """The rate [Hz] as a number; an `InputError` if it or the interpolation is not allowed."""
     if interpolation not in INTERPOLATIONS:
         allowed = " and ".join(INTERPOLATIONS)
         raise InputError("", "interpolation", f"{interpolation!r} given; allowed are {allowed}")
@@ -313,16 +298,12 @@ def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
     t, h = rows[:, 0], np.diff(rows[:, 0])[:, None]
     # At a step the earlier row has the torques before it.
     before = np.append(h[:, 0] == 0, False)
-    exact = torque.at(np.where(before, np.nextafter(t, -np.inf), t))
-    while True:
+    exact, wrong = torque.at(np.where(before, np.nextafter(t, -np.inf), t)), np.ones(1, dtype=bool)
+    while wrong.any():
         steep = (h > 0) & (np.abs(np.diff(rows[:, 1:], axis=0)) > rate_limit * h)
-        wrong = np.zeros(exact.shape, dtype=bool)
-        wrong[:-1] |= steep
-        wrong[1:] |= steep
-        wrong &= rows[:, 1:] != exact
-        if not wrong.any():
-            return
-        rows[:, 1:][wrong] = exact[wrong]
+        steep = np.pad(steep, ((1, 1), (0, 0)))
+        wrong = (steep[1:] | steep[:-1]) & (rows[:, 1:] != exact)
+        np.copyto(rows[:, 1:], exact, where=wrong)
 
 
 def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:

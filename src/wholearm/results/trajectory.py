@@ -50,31 +50,26 @@ class Motion(Protocol):
 class Trajectory(Drawn):
     """A planned motion: samples for files and plots, motions for any instant."""
 
-    # (n,) [s]: even within each phase of a plan; a phase boundary is there twice, since torques and
-    # forces step, and so is where a phase is at its end and is held there. In a replay any other
-    # step is, too.
+    # (n,) [s]: even within each phase of a plan; a time is there twice where torques and forces
+    # step: between phases, where the end of one begins to be held, and anywhere in a replay
     t: Array
-    q: Array  # q, theta (n, 3) and (n, 2) [m, m, rad] and [rad]:
-    theta: Array
-    # q_dot, theta_dot, q_ddot, theta_ddot: first and second derivatives with respect to time
-    q_dot: Array
+    q: Array  # (n, 3) [m, m, rad]
+    theta: Array  # (n, 2) [rad]
+    q_dot: Array  # first and second derivatives with respect to time
     theta_dot: Array
     q_ddot: Array
     theta_ddot: Array
     tau: Array  # (n, 2) [N m]
     contacts: tuple[str, ...]  # every contact of the plan
-    # c_n, c_t (n, m) [N]: naN where a contact is not in the formation, or at rest, where forces are
-    # not determined
+    # (n, m) [N]: NaN where a contact is not in the formation, or at rest, where none is determined
     c_n: Array
     c_t: Array
     phase: NDArray[np.int64]  # (n,): index of the phase, from 0
-    # the torques at any instant, exact between samples, with every step at a break
-    torque: TorqueProfile
+    torque: TorqueProfile  # exact between samples, with every step at a break
     # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant;
     # those of a loaded one interpolate the samples.
     motions: tuple[Motion, ...]
-    # status, epsilon and the problem, and of a plan everything else that `Plan` says
-    meta: Mapping[str, Any]
+    meta: Mapping[str, Any]  # status, epsilon, the problem, and of a plan all else that it says
 
     @property
     def headline(self) -> str:
@@ -101,16 +96,14 @@ class Trajectory(Drawn):
     @property
     def rolling(self) -> NDArray[np.bool_]:
         """Which contacts roll, shape (n, m), as `meta` names them by phases and modes."""
-        mask = np.zeros(self.c_t.shape, dtype=bool)
+        mask, starts = np.zeros(self.c_t.shape, dtype=bool), self.phase_starts
         for index, names in enumerate(self.meta.get("rolling", [])):
             mask[self.phase == index] = [name in names for name in self.contacts]
-        starts = self.phase_starts
         for index, modes in enumerate(self.meta.get("modes", [])):
             for mode in modes:
-                passed = self.t - starts[index]
-                rows = (self.phase == index) & (passed >= mode["start"]) & (passed <= mode["stop"])
-                rolls = [mode["contacts"].get(name) == "rolls" for name in self.contacts]
-                mask[rows] |= rolls
+                passed = np.where(self.phase == index, self.t - starts[index], np.nan)
+                rows = (passed >= mode["start"]) & (passed <= mode["stop"])
+                mask[rows] |= [mode["contacts"].get(name) == "rolls" for name in self.contacts]
         return mask
 
     @property
@@ -141,17 +134,17 @@ class Trajectory(Drawn):
         if not inside.all():
             wrong = times[~inside][0]
             raise ValueError(f"t = {wrong} s is outside the trajectory, 0 to {starts[-1]} s")
-        owner = np.searchsorted(starts, times, side="right") - 1
-        owner = np.minimum(owner, len(self.motions) - 1)
+        owner = np.searchsorted(starts[1:-1], times, side="right")
         n, m = len(times), len(self.contacts)
         fields = Samples(*(np.full((n, width), np.nan) for width in (5, 5, 5, 2, m, m)))
         for index in sorted(set(owner.tolist())):
             motion, rows = self.motions[index], np.flatnonzero(owner == index)
             part = motion.evaluate(times[rows] - starts[index])
-            contact_columns = [self.contacts.index(name) for name in motion.contacts]
-            for k, (whole, values) in enumerate(zip(fields, part, strict=True)):
-                columns = slice(None) if k < 4 else contact_columns
-                whole[rows[:, None], np.arange(whole.shape[1])[columns]] = values
+            columns = [self.contacts.index(name) for name in motion.contacts]
+            for whole, values in zip(fields[:4], part[:4], strict=True):
+                whole[rows] = values
+            for whole, values in zip(fields[4:], part[4:], strict=True):
+                whole[rows[:, None], columns] = values
         return fields
 
     def find_steps(self) -> NDArray[np.int64]:
@@ -160,12 +153,10 @@ class Trajectory(Drawn):
         At a new phase, a step of the torques, and where a sliding direction is reversed. Steps of
         torques below a tenth of the largest cannot be seen.
         """
-        profile = self.torque
-        least = 0.1 * np.abs(profile.coefficients).max()
-        stepping = np.abs(profile.jumps).max(axis=1) > least
-        breaks, starts = profile.breaks[1:-1], self.phase_starts
-        inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * self.duration
-        t = self.t
+        torque, t = self.torque, self.t
+        stepping = np.abs(torque.jumps).max(axis=1) > 0.1 * np.abs(torque.coefficients).max()
+        breaks = torque.breaks[1:-1]
+        inner = np.abs(breaks[:, None] - self.phase_starts).min(axis=1) > 1e-9 * self.duration
         # Where a time is there twice, in a replay, the step is between the two rows.
         repeated = np.flatnonzero(np.diff(t) == 0) + 1
         single = np.setdiff1d(breaks[stepping & inner], t[repeated])
@@ -192,12 +183,7 @@ class Trajectory(Drawn):
         write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     def save_torques(self, path: str | os.PathLike[str]) -> None:
-        """Write the torques as CSV, ``t,tau1,tau2``, a repeated time being a step.
-
-        Rows are as dense as the torques are bent; `planning.replay_check` also replays them.
-
-        InputError if the file cannot be written.
-        """
+        """Write the torques as CSV; see `results.adopt.save`."""
         require_ending(path, ".csv")
         write_text(path, format_rows(place_rows(self.torque)))
 

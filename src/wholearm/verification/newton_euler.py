@@ -84,6 +84,7 @@ class Touch(NamedTuple):
     normal: Array
     tangent: Array
     friction: float  # coefficient mu
+    point: Array  # (n, 2) [m]
 
 
 def balance(
@@ -176,7 +177,7 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
         row[:, :2], row[:, 2] = direction, cross_product(point - z[:, :2], direction)
         if finger is not None:
             row[:, 3 + finger] = -cross_product(point - base, direction)
-    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
+    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger), point)
 
 
 def _rotate(vector: Array, c: Array, s: Array) -> Array:

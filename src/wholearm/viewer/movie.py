@@ -21,12 +21,11 @@ from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
-from ..contacts.elemental import parse_contact
 from ..figures import snapshots, style
 from ..figures.plots import draw_margins, draw_phases, draw_torques
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
-from .page import place_pushes
+from .page import Pushes
 
 FRAMES = 25  # frames in a second of the movie
 TURNS, GHOST = "#D55E00", "#bbbbbb"
@@ -41,23 +40,21 @@ class _Scene:
     ) -> None:
         scene = self._scene = problem.scene
         self._axes, self._trajectory, self._ghost = axes, trajectory, ghost
-        points, normals, forces = place_pushes(scene, trajectory)
+        points, normals, tangents, forces, friction = Pushes.of(scene, trajectory)
         low, high = snapshots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
         self._size = float((high - low).max())
         styles = style.choose_styles(trajectory.contacts)
         self._colours = [styles[name].colour for name in trajectory.contacts]
-        fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
-        friction = np.array([scene.friction.of(finger) for finger in fingers])
         # Square roots: small forces are to be seen beside large ones.
         strengths = np.hypot(*forces.T).T[..., None]
         strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
         scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
         self._points, self._arrows = points, 0.3 * self._size * forces / scales
-        self._presses = np.isfinite(forces).all(axis=2)
+        self._presses = np.asarray(np.isfinite(forces).all(axis=2))
         # Friction cones are longer than the arrows in them.
         reach = 1.15 * np.maximum(np.hypot(*self._arrows.T).T, 0.03 * self._size)[..., None]
-        tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1) * friction[:, None]
-        sides = [points + reach * (normals + sign * tangents) for sign in (1, -1)]
+        edges = friction[:, None] * tangents
+        sides = [points + reach * (normals + sign * edges) for sign in (1, -1)]
         self._cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
         every = np.vstack([low, high, self._cones[self._presses].reshape(-1, 2)])
         low, high = every.min(axis=0) - 0.05 * self._size, every.max(axis=0) + 0.05 * self._size

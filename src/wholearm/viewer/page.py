@@ -7,20 +7,18 @@ import math
 from collections.abc import Iterable
 from html import escape
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, find_runs
 from ..common.document import plain
-from ..common.sharing import exclusive
 from ..contacts.closing import Numbers
-from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
+from ..verification.newton_euler import locate
 
 
 def build_page(title: str, parts: Iterable[str]) -> str:
@@ -60,24 +58,25 @@ def _embed(value: dict[str, Any]) -> str:
     return f'<script type="application/json">{text}</script>'
 
 
-@exclusive
-def place_pushes(scene: Scene, trajectory: Trajectory) -> tuple[Array, Array, Array]:
-    """Contacts and their forces at the n samples of a trajectory.
+class Pushes(NamedTuple):
+    """Contacts and their forces at the n samples of a trajectory."""
 
-    Returns
-    -------
-    points : (n, m, 2) [m]
-    normals : (n, m, 2)     into the object
-    forces : (n, m, 2) [N]  c_n n + c_t t; NaN where a contact has none, or none is known
-    """
-    places = [build_geometry(parse_contact(name, scene), scene) for name in trajectory.contacts]
-    rows = [ca.vertcat(place.point, place.normal) for place in places]
-    evaluate = ca.Function("places", [build_features(scene).z], [ca.vertcat(*rows)])
-    values = evaluate(trajectory.z.T).full().T.reshape(len(trajectory.t), -1, 4)
-    points, normals = values[..., :2], values[..., 2:]
-    tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1)
-    forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
-    return points, normals, forces
+    points: Array  # (n, m, 2) [m]
+    normals: Array  # (n, m, 2): into the object
+    tangents: Array  # (n, m, 2)
+    forces: Array  # (n, m, 2) [N]: NaN where a contact has none, or none is known
+    friction: Array  # (m,): coefficients mu
+
+    @staticmethod
+    def of(scene: Scene, trajectory: Trajectory) -> Pushes:
+        """Those of a trajectory."""
+        touches = [locate(scene, name, trajectory.z) for name in trajectory.contacts]
+        points = np.stack([touch.point for touch in touches], axis=1)
+        normals = np.stack([touch.normal[:, :2] for touch in touches], axis=1)
+        tangents = np.stack([touch.tangent[:, :2] for touch in touches], axis=1)
+        forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
+        friction = np.array([touch.friction for touch in touches])
+        return Pushes(points, normals, tangents, forces, friction)
 
 
 def describe_motion(
@@ -91,7 +90,7 @@ def describe_motion(
     ghost    another motion of the same hand, drawn behind: a replay
     most     about as many samples are taken at most
     """
-    scene, (points, normals, _) = problem.scene, place_pushes(problem.scene, trajectory)
+    scene, pushes = problem.scene, Pushes.of(problem.scene, trajectory)
     styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)
     contacts = list[dict[str, Any]]()
@@ -101,15 +100,15 @@ def describe_motion(
         spans = [
             {
                 "first": run.start,
-                "point": _fix(points[rows[run], index], scene),
-                "normal": _fix(normals[rows[run], index], scene),
+                "point": _fix(pushes.points[rows[run], index], scene),
+                "normal": _fix(pushes.normals[rows[run], index], scene),
                 "c": _round(c[run]),
             }
             for run in find_runs(np.isfinite(c).all(axis=1), least=2)
         ]
         dashes = [] if styles[name].line == "-" else list(styles[name].line[1])
-        friction = scene.friction.of(parse_contact(name, scene).finger)
         look = {"name": name, "colour": styles[name].colour, "dashes": dashes}
+        friction = float(pushes.friction[index])
         contacts.append(look | {"friction": friction, "spans": spans})
     behind = None
     if ghost is not None:
