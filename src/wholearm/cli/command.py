@@ -83,17 +83,17 @@ PLANNING = re.sub(r"^--samples .*\n", "", PLANNER, flags=re.M) + MARGIN
 OBJECTIVE = PLANNING[: PLANNING.index("--accuracy")]
 
 TABLE = f"""\
-[[new]]  write_problem  write a problem file to begin with
+[[new]]  write a problem file to begin with
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
 --size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
 --vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
     0.08,0.03 0,0.09'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
-[[schema]]  show_schema  print the JSON Schema of problem files, for editors
+[[schema]]  print the JSON Schema of problem files, for editors
 -o --output FILE  file to write, instead of printing
 --table           all keys with unit, default and range as tables (Markdown) instead
-[[solve]]  solve  plan joint torques for a problem file
+[[solve]]  plan joint torques for a problem file
 {PROBLEM}\
 -o --output FILE        trajectory file to write (default: NAME.npz)
 --torques FILE          also write the torques as CSV
@@ -101,7 +101,7 @@ name               the problem's name; NAME.toml is written
     (none) in 1e-9..1e12
 --interpolation NAME    of samples: linear, or hold for sample-and-hold (linear)
 {PLANNER}{MARGIN}{SEARCH}{JSON}\
-[[verify]]  verify  replay torques open loop and check the motion
+[[verify]]  replay torques open loop and check the motion
 {PROBLEM}\
 torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
@@ -119,7 +119,7 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
 -o --output FILE  trajectory file to write (.npz) of the replayed motion, for plot
 {JSON}\
-[[plot]]  plot  draw force margins, torques and snapshots
+[[plot]]  draw force margins, torques and snapshots
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
@@ -127,7 +127,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
     among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
-[[predict]]  predict  see up to which speed slow motions keep every contact
+[[predict]]  see up to which speed slow motions keep every contact
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
@@ -135,7 +135,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --speed V         mean speed along the phases for these [m/s], over which they are spread in time
     (0.05) in 1e-9..1e6
 {JSON}\
-[[tune]]  tune  tune torques from quasistatic ones by steps of 10 percent
+[[tune]]  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
@@ -145,30 +145,30 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
 {JSON}\
-[[compare]]  compare  put plans and torques for a problem side by side
+[[compare]]  put plans and torques for a problem side by side
 {PROBLEM}\
 files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 -o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
 {JSON}\
-[[route]]  route  find the contact formations that lead to a goal, and plan
+[[route]]  find the contact formations that lead to a goal, and plan
 problem           problem file (TOML) with [goal] in place of [[phases]]
 -o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
 --alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
 --objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
 {SEARCH}{JSON}\
-[[map]]  draw_map  draw the contact formations over (x, phi)
+[[map]]  draw the contact formations over (x, phi)
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg; default: map_NAME.png)
 --plan FILE       trajectory file (.npz) to draw over it
 --phi LOW,HIGH    range of phi [deg] (default: the plan's)
 --list X,PHI ...  print the formations along a route of two or more poses [m, deg] as [[phases]]
 {MARGIN}\
-[[export]]  export  write scene and plan for a physics engine
+[[export]]  write scene and plan for a physics engine
 {PROBLEM}\
 [plan]            trajectory file (.npz) that the model plays
 --mjcf FILE       file to write (.xml): the scene in MuJoCo's format (required)
 --step            time step of the model [s] (from the scene) in 1e-15..1e6
-[[replay]]  replay  replay a plan in MuJoCo or Drake and compare it with the plan
+[[replay]]  replay a plan in MuJoCo or Drake and compare it with the plan
 {PROBLEM}{PLAN}\
 --engine NAME     mujoco or drake, installed with the extra of that name (required)
 --whole           from start to end, instead of phase by phase from each planned start
@@ -180,7 +180,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
 {JSON}\
-[[policy]]  policy  make torques a function of the joints, by feedback
+[[policy]]  make torques a function of the joints, by feedback
 {PLAN}\
 -o --output FILE  policy to write (.npz; default: NAME_policy.npz)
 --reserve         normal force that is kept in reserve along the way: where plan or problem have
@@ -195,7 +195,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     (1e-3) in 1e-9..1e3
 --write-anyway    write the policy although its simulation does not hold, marked so in its file
 {JSON}\
-[[robustness]]  robustness  see how much error a plan bears
+[[robustness]]  see how much error a plan bears
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808
@@ -218,7 +218,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
 {JSON}\
-[[sweep]]  sweep  plan a grid of other values of the numbers in problem files
+[[sweep]]  plan a grid of other values of the numbers in problem files
 problems PROBLEM ...   problem files (TOML)
 --vary NAME=VALUES ...  what is varied, by the names of Problem.with_: LOW:HIGH:COUNT, or
     VALUE,VALUE,... of numbers or words, as in torque_limit=1:3:5 phases[5].until.phi_deg=-50,-45;
@@ -236,7 +236,7 @@ problems PROBLEM ...   problem files (TOML)
 --scheduler ADDRESS    run on the cluster of this Dask scheduler (extra: cluster)
 --time-limit S         longest time for one point (none) in 1e-3..1e9
 {PLANNING}{JSON}\
-[[sensitivities]]  sensitivities  see what 1 percent more of each number in a problem file is worth
+[[sensitivities]]  see what 1 percent more of each number in a problem file is worth
 problem            problem file (TOML)
 [plan]             trajectory file (.npz) of its plan, whose objective and options count
 --of NAME ...      these numbers alone, by the names of Problem.with_ (default: all but corners)
@@ -244,7 +244,7 @@ problem            problem file (TOML)
 -o --output FILE   figure to write (.png, .pdf, .svg): a bar for each number
 --jobs N           processes (default: all cores) in 1..256
 {PLANNING}{JSON}\
-[[design]]  find_hand  find the hand that does a job best
+[[design]]  find the hand that does a job best
 problems PROBLEM ...   problem files (TOML), for one hand
 --over NAME=LOW:HIGH ...  numbers to choose and their ranges, by the names of Problem.with_, as in
     length1=0.1:0.25 base1_x=0.06:0.1 (required)
@@ -260,29 +260,29 @@ problems PROBLEM ...   problem files (TOML), for one hand
 --figure FILE          also draw the path of the search (.png, .pdf, .svg)
 --jobs N               processes (default: all cores) in 1..256
 {PLANNING.replace(OBJECTIVE, "")}{JSON}\
-[[animate]]  animate  make a movie of a plan, or a page that plays it
+[[animate]]  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
     (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
 --simulate [free]  draw the simulated motion behind; free: simulated without telling which contacts
     hold among told|free
-[[report]]  report  put a problem and its plans into one page to open anywhere
+[[report]]  put a problem and its plans into one page to open anywhere
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
 -o --output FILE  page to write (default: NAME.html)
 --sensitivities   also show what 1 percent more of each number of the problem is worth
-[[gallery]]  gallery  plan problems and show them all on one page
+[[gallery]]  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md); figures and movies go to a folder beside it
     = results/gallery.md
-[[help]]  show_page  print a page of the documentation, or list its topics
+[[help]]  print a page of the documentation, or list its topics
 [topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
-[[completion]]  complete  print what makes a shell complete all this
+[[completion]]  print what makes a shell complete all this
 shell  bash, zsh or tcsh; needs the extra completion
 """
-"""Commands but `bench`: name, function that carries it out, what it is for, and then its files and
-options as of `read_options`."""
+"""Commands but `bench`: name, what it is for, and then its files and options as of `read_options`.
+The function of its name, after an underscore, carries a command out."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -363,9 +363,9 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
         head, _, table = part.partition("\n")
-        name, run, text = re.split(r" {2,}", head)
-        subparser = add_parser(commands, name.strip("[]"), text, table)
-        subparser.set_defaults(run=globals()[run])
+        name, text = head.removeprefix("[[").split("]]  ")
+        subparser = add_parser(commands, name, text, table)
+        subparser.set_defaults(run=globals()[f"_{name}"])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
     bench.set_defaults(run=_list_studies)
@@ -551,8 +551,7 @@ def tell_origin(
     return {"notes": notes} if notes else {}
 
 
-def solve(options: argparse.Namespace) -> int:
-    """Plan, and write the plan."""
+def _solve(options: argparse.Namespace) -> int:
     from ..planning.plan import solve_with
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
@@ -613,8 +612,7 @@ def _choose_table(options: argparse.Namespace) -> Callable[[wholearm.Plan], Torq
     return lambda plan: replay_check.sample_table(plan.problem, plan.trajectory, *sampling)
 
 
-def verify(options: argparse.Namespace) -> int:
-    """Replay torques, and print the verdict."""
+def _verify(options: argparse.Namespace) -> int:
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
     values = list_given(options, *keys)
@@ -653,8 +651,7 @@ def _is_table(path: str) -> bool:
     return require_ending(path, ".npz", ".csv") == ".csv"
 
 
-def plot(options: argparse.Namespace) -> int:
-    """Draw a plan, or the replay of torques."""
+def _plot(options: argparse.Namespace) -> int:
     require_output(options.output)
     if not _is_table(options.trajectory):
         trajectory = wholearm.load_trajectory(options.trajectory)
@@ -688,8 +685,7 @@ def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> Simulatio
     return wholearm.simulate(problem, trajectory.torque, progress=say)
 
 
-def predict(options: argparse.Namespace) -> int:
-    """Predict up to which speed quasistatic motions keep contacts, and write what is asked for."""
+def _predict(options: argparse.Namespace) -> int:
     from ..analysis.slow_speeds import make_torques
 
     require_output(options.output)
@@ -705,8 +701,7 @@ def predict(options: argparse.Namespace) -> int:
     return status
 
 
-def tune(options: argparse.Namespace) -> int:
-    """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
+def _tune(options: argparse.Namespace) -> int:
     require_output(options.output, ".csv")
     values = list_given(options, "brake", "stops", "squeeze", "share")
     tuning = wholearm.tune(wholearm.load(options.problem), **values, progress=show_progress())
@@ -716,8 +711,7 @@ def tune(options: argparse.Namespace) -> int:
     return finish(options, tuning, output)
 
 
-def compare(options: argparse.Namespace) -> int:
-    """Replay plans and torques for one problem, print the tables, and draw the margins."""
+def _compare(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem = wholearm.load(options.problem)
     comparison = wholearm.compare(problem, options.files, show_progress())
@@ -725,8 +719,7 @@ def compare(options: argparse.Namespace) -> int:
     return finish(options, comparison, options.output)
 
 
-def robustness(options: argparse.Namespace) -> int:
-    """Replay samples, and print what becomes of them."""
+def _robustness(options: argparse.Namespace) -> int:
     from ..problem.definition import spread_widths
 
     # A file for each study that differs by more than numbers: its problem, phase and policy.
@@ -767,8 +760,7 @@ def robustness(options: argparse.Namespace) -> int:
     return finish(options, study, output, options.figure, notes=notes)
 
 
-def route(options: argparse.Namespace) -> int:
-    """Find a route, print its phases, and draw it if that is asked for."""
+def _route(options: argparse.Namespace) -> int:
     require_output(options.output)
     answer = find_route(options, read_problem(options), options.alternatives)
     clear_progress()
@@ -824,8 +816,7 @@ def _save_map(
     clear_progress()
 
 
-def draw_map(options: argparse.Namespace) -> int:
-    """Draw the map, or list the formations along a route, or both."""
+def _map(options: argparse.Namespace) -> int:
     poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
     if phi and not 0 < phi[1] - phi[0] <= 360:
@@ -875,8 +866,7 @@ def _load_replayed(options: argparse.Namespace, silent: bool) -> LoadedPlan:
     return problem, plan, policy, notes
 
 
-def export(options: argparse.Namespace) -> int:
-    """Write the scene, with a plan if one is given."""
+def _export(options: argparse.Namespace) -> int:
     require_output(options.mjcf, ".xml")
     problem, plan = read_problem(options), None
     _check_step(options, problem)
@@ -887,8 +877,7 @@ def export(options: argparse.Namespace) -> int:
     return finish(options, None, options.mjcf)
 
 
-def replay(options: argparse.Namespace) -> int:
-    """Replay a plan in an engine, and print the report."""
+def _replay(options: argparse.Namespace) -> int:
     from ..engines.engine_replay import ALLOWED, ENGINES, require_engine
 
     require_engine(options.engine)
@@ -914,8 +903,7 @@ def replay(options: argparse.Namespace) -> int:
     return finish(options, report, notes=notes)
 
 
-def policy(options: argparse.Namespace) -> int:
-    """Make torques a function of the joints, simulate that, and write it if it holds."""
+def _policy(options: argparse.Namespace) -> int:
     from ..policy.make import find_widest
     from ..problem.read import read_own_problem
 
@@ -984,8 +972,7 @@ def policy(options: argparse.Namespace) -> int:
     return status
 
 
-def sweep(options: argparse.Namespace) -> int:
-    """Plan all points, print and write their table, and draw it if that is asked for."""
+def _sweep(options: argparse.Namespace) -> int:
     from ..design.sweep import read_vary
     from ..problem.read import read_problem
 
@@ -1017,8 +1004,7 @@ def sweep(options: argparse.Namespace) -> int:
     return finish(options, result, output, options.figure)
 
 
-def sensitivities(options: argparse.Namespace) -> int:
-    """Print a table of sensitivities, and draw it if that is asked for."""
+def _sensitivities(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem, notes = wholearm.load(options.problem), dict[str, list[str]]()
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
@@ -1037,8 +1023,7 @@ def sensitivities(options: argparse.Namespace) -> int:
     return finish(options, result, options.output, notes=notes)
 
 
-def find_hand(options: argparse.Namespace) -> int:
-    """Find the best hand, write its problem files, and draw the search if that is asked for."""
+def _design(options: argparse.Namespace) -> int:
     outputs = [f"{Path(path).stem}_design.toml" for path in options.problems]
     outputs[:1] = [options.output or outputs[0]]
     for path in outputs:
@@ -1058,8 +1043,7 @@ def find_hand(options: argparse.Namespace) -> int:
     return finish(options, result, *outputs, options.figure)
 
 
-def gallery(options: argparse.Namespace) -> int:
-    """Plan problems, and write their page."""
+def _gallery(options: argparse.Namespace) -> int:
     from ..viewer.report_page import write_gallery
 
     require_output(options.output, ".md")
@@ -1067,8 +1051,7 @@ def gallery(options: argparse.Namespace) -> int:
     return finish(options, None, options.output)
 
 
-def animate(options: argparse.Namespace) -> int:
-    """Write a movie, or a page."""
+def _animate(options: argparse.Namespace) -> int:
     from ..problem.read import read_own_problem
 
     require_output(options.output, ".gif", ".mp4", ".html")
@@ -1090,8 +1073,7 @@ def animate(options: argparse.Namespace) -> int:
     return finish(options, None, options.output)
 
 
-def report(options: argparse.Namespace) -> int:
-    """Write the page of a problem and its plans."""
+def _report(options: argparse.Namespace) -> int:
     from ..viewer.report_page import build_report
 
     stem = Path(options.problem).stem
@@ -1108,8 +1090,7 @@ def report(options: argparse.Namespace) -> int:
     return finish(options, None, output)
 
 
-def show_page(options: argparse.Namespace) -> int:
-    """Print a page of the documentation, or the topics."""
+def _help(options: argparse.Namespace) -> int:
     if options.topic is not None:
         print(read_page(TOPICS[options.topic]), end="")
         return 0
@@ -1133,8 +1114,7 @@ def read_page(folder: str) -> str:
     return re.sub(r"\[([^\]]+)\]\(([^)#]*)#?([^)]*)\)", name, text)
 
 
-def complete(options: argparse.Namespace) -> int:
-    """Print what a shell needs to complete commands."""
+def _completion(options: argparse.Namespace) -> int:
     shells = ("bash", "zsh", "tcsh")
     if options.shell not in shells:
         raise InputError("", "shell", f"{options.shell!r} given; allowed are {', '.join(shells)}")
@@ -1162,8 +1142,7 @@ def _complete_files(parser: Parser, files: object, folders: object) -> None:
             action.complete = files  # type: ignore[attr-defined]
 
 
-def write_problem(options: argparse.Namespace) -> int:
-    """Write a problem file to begin with."""
+def _new(options: argparse.Namespace) -> int:
     import numpy as np
 
     from ..mapping.formation_list import write_template
@@ -1186,8 +1165,7 @@ def write_problem(options: argparse.Namespace) -> int:
     return 0
 
 
-def show_schema(options: argparse.Namespace) -> int:
-    """Print or write the schema, or the tables of keys."""
+def _schema(options: argparse.Namespace) -> int:
     from ..problem.read import build_schema, write_page
 
     text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"

@@ -23,6 +23,7 @@ from ..common.fields import (
     declare,
     key,
     leave,
+    refer,
 )
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -141,7 +142,7 @@ class Until:
         "What ends the phase: a contact that is gained, or a coordinate; with two freedoms also "
         "both, or both coordinates: the one with the longer way ends it. Left out with end = "
         "'smooth': where the planner lets a contact go.",
-        leave({}),
+        leave({"oneOf": [refer("contact"), refer("until")]}),
         default=None,
     ),
     key("end", "How the phase passes into the next one.", choice(*(end.value for end in End))),
@@ -156,7 +157,7 @@ class Until:
         "in order, each with time t since the start of the phase [s], x [m] and phi_deg at its "
         "end, and the signs of the sliding velocities of `contacts` (0 if one rolls) and of the "
         "joint velocities, such as '-+0 ++'.",
-        leave({"type": "array", "minItems": 1}),
+        leave({"type": "array", "minItems": 1, "items": refer("mode")}),
     ),
 )
 @dataclass(frozen=True, eq=False)

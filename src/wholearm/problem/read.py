@@ -55,7 +55,6 @@ from .definition import (
 )
 
 _T = TypeVar("_T")
-_GOAL = "allowed is a table with flush or phi_deg, and x"
 Table = Mapping[str, Field]
 """Keys of a table by name."""
 
@@ -78,9 +77,9 @@ START = name_fields(
     declare("x", "Of the centroid [m]; both fingers close on the object.", NUMBER, "length", PLACE),
 )
 UNTIL = name_fields(
-    declare("contact", "", leave(refer("contact"))),
-    declare("x", "[m]"),
-    declare("phi_deg", "[degrees]"),
+    declare("contact", "", leave(refer("contact")), default=None),
+    declare("x", "[m]", default=None),
+    declare("phi_deg", "[degrees]", default=None),
 )
 MODE = name_fields(
     *map(declare, ("t", "x", "phi_deg")),
@@ -88,8 +87,21 @@ MODE = name_fields(
 )
 UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
 _PARTS = name_fields(
-    *map(declare, ("object", "fingers", "friction", "start")),
-    *(declare(name, default=None) for name in ("uncertainty", "goal", "phases")),
+    *(declare(name, kind=leave(refer(name))) for name in ("object", "fingers", "start")),
+    declare("friction", "Coefficients of friction with the object.", leave(refer("friction"))),
+    declare(
+        "uncertainty",
+        "Ranges of what is not known exactly, for robustness and solve --robust.",
+        leave(refer("uncertainty")),
+        default=None,
+    ),
+    declare(
+        "goal",
+        "Where the object shall come to lie, in place of phases; several are visited in order.",
+        leave({"oneOf": [refer("goal"), {"type": "array", "items": refer("goal")}]}),
+        default=None,
+    ),
+    declare("phases", kind=leave({"type": "array", "items": refer("phase")}), default=None),
 )
 TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
 
@@ -247,13 +259,13 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         if not isinstance(signs, str) or not re.fullmatch(rf"[-+0]{{{count}}} [-+]{{2}}", signs):
             text = f"allowed are {count} of -, +, 0 for {' '.join(formation.names)}"
             raise InputError("", f"{name}.signs", f"{signs!r} given; {text}, and - or + per joint")
-        for k, contact in enumerate(formation.contacts):
-            if contact in formation.rolling and signs[k] != "0":
-                raise InputError(
-                    "", f"{name}.signs", f"{signs!r} given; {contact} rolls: allowed is 0"
-                )
-            if signs[k] == "0" and formation.friction[k] == 0:
+        for contact, sign, mu in zip(formation.contacts, signs, formation.friction, strict=False):
+            text = ""
+            if contact in formation.rolling and sign != "0":
+                text = f"{contact} rolls: allowed is 0"
+            elif sign == "0" and mu == 0:
                 text = f"{contact} cannot roll without friction"
+            if text:
                 raise InputError("", f"{name}.signs", f"{signs!r} given; {text}")
         values = tuple({"-": -1.0, "0": 0.0, "+": 1.0}[sign] for sign in signs if sign != " ")
         modes.append(ModeGuess(t, x, math.radians(phi), values))
@@ -379,14 +391,13 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
     for index, entry in enumerate(given if several else [given], start=1):
         key = f"goal[{index}]" if several else "goal"
         if not isinstance(entry, Mapping):
-            raise InputError("", key, f"{entry!r} given; {_GOAL}")
-        for name in entry:
-            if name not in GOAL:
-                raise InputError("", f"{key}.{name}", f"unknown key; {_GOAL}")
-        phi, x = entry.get("phi_deg"), entry.get("x")
-        phi = None if phi is None else math.radians(require_number(phi, f"{key}.phi_deg"))
-        x = None if x is None else require_number(x, f"{key}.x")
-        goals.append(Goal(entry.get("flush"), phi, x))
+            text = f"{entry!r} given; allowed is a table with flush or phi_deg, and x"
+            raise InputError("", key, text)
+        check_keys(entry, key, GOAL)
+        values = {name: GOAL[name].read(entry[name], f"{key}.{name}") for name in entry}
+        if "phi_deg" in values:
+            values["phi"] = math.radians(values.pop("phi_deg"))
+        goals.append(Goal(**values))
     return tuple(goals)
 
 
@@ -526,64 +537,37 @@ def name_keys() -> dict[str, tuple[str, ...]]:
 
 def build_schema() -> dict[str, Any]:
     """The JSON Schema of problem files."""
-    goal = {"oneOf": [{"required": ["flush"]}, {"required": ["phi_deg"]}]}
-    until = {
-        "type": "object",
-        "additionalProperties": False,
-        "minProperties": 1,
-        "properties": _describe(UNTIL),
-    }
-    ends = [
-        {"required": ["until"]},
-        {"required": ["end"], "properties": {"end": {"const": "smooth"}}},
-    ]
-    phase = _describe_table(PHASE) | {"anyOf": ends}
-    phase["properties"]["until"]["oneOf"] = [refer("contact"), until]
-    phase["properties"]["guess"]["items"] = _describe_table(MODE)
-    goals = [refer("goal"), {"type": "array", "items": refer("goal")}]
-    parts = {
-        "object": _describe_table(OBJECT),
-        "fingers": _describe_table(FINGERS),
-        "friction": _describe_table(FRICTION, "Coefficients of friction with the object."),
-        "start": _describe_table(START),
-        "uncertainty": _describe_table(
-            UNCERTAINTY, "Ranges of what is not known exactly, for robustness and solve --robust."
-        ),
-        "goal": {
-            "description": "Where the object shall come to lie, in place of phases; several are "
-            "visited in order.",
-            "oneOf": goals,
-        },
-        "phases": {"type": "array", "items": phase},
-    }
-    whole = _describe_table(
-        TOP,
-        "A polygon, a hand of a palm and two fingers, a start, and the contact formations to go "
-        "through. SI units.",
-    )
-    whole["properties"] |= parts
-    definitions = {
+    tables = {
+        "object": OBJECT, "fingers": FINGERS, "finger": FINGER, "friction": FRICTION,
+        "start": START, "uncertainty": UNCERTAINTY, "goal": GOAL, "phase": PHASE, "until": UNTIL,
+        "mode": MODE,
+    }  # fmt: skip
+    definitions = {name: _describe(table) for name, table in tables.items()}
+    smooth = {"required": ["end"], "properties": {"end": {"const": "smooth"}}}
+    definitions["phase"]["anyOf"] = [{"required": ["until"]}, smooth]
+    definitions["goal"]["oneOf"] = [{"required": ["flush"]}, {"required": ["phi_deg"]}]
+    definitions["until"]["minProperties"] = 1
+    definitions |= {
         "contact": CONTACT,
-        "goal": _describe_table(GOAL) | goal,
         "point": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number"}},
         "coefficient": {**NONNEGATIVE.schema, "maximum": COEFFICIENTS.high},
-        "finger": _describe_table(FINGER),
     }
-    first = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "wholearm problem"}
-    return first | whole | {"definitions": definitions}
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "wholearm problem",
+        "description": "A polygon, a hand of a palm and two fingers, a start, and the contact "
+        "formations to go through. SI units.",
+        **_describe(TOP),
+        "definitions": definitions,
+    }
 
 
 def _describe(table: Table) -> dict[str, Any]:
-    return {name: field.schema for name, field in table.items()}
-
-
-def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
     return {
         "type": "object",
-        **({"description": text} if text else {}),
         "additionalProperties": False,
         "required": [name for name, field in table.items() if field.required],
-        "properties": _describe(table),
+        "properties": {name: field.schema for name, field in table.items()},
     }
 
 
