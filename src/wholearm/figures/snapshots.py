@@ -18,11 +18,12 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..common.document import fixed
 from ..contacts.elemental import parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from ..verification.newton_euler import locate
-from .style import BODY, FINGERS, INK, PALM, Styles, add_line, count_decimals, inset, write
+from .style import BODY, FINGERS, INK, PALM, Styles, add_line, inset, write
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
 CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that gives the scale [in]
@@ -218,7 +219,7 @@ def draw_strip(
     """Draw the snapshots of a strip whose upper end is at `top` [in], with times and phases."""
     room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
     height = strip.scale * (strip.high - strip.low)
-    decimals = count_decimals(trajectory.duration)
+    form = fixed(min(trajectory.duration, 0.9))
     # A bar of a round length, about a quarter of an inch long, gives the scale.
     power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
     length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
@@ -240,7 +241,7 @@ def draw_strip(
             names = [name for name in names if presses[name]] or names
             draw_snapshot(axes, scene, trajectory.z[k], names, styles, box)
             place = "end" if k == last else f"phase {trajectory.phase[k] + 1}"
-            caption = f"{trajectory.t[k]:.{decimals}f} s\n{place}"
+            caption = f"{trajectory.t[k]:{form}} s\n{place}"
             write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
             left += width + space
 

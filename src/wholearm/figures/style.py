@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
@@ -83,10 +82,6 @@ def choose_prefix(size: float) -> tuple[str, float]:
     steps = ((1e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
     return next((prefix, factor) for least, prefix, factor in steps if size >= least)
 
-
-def count_decimals(size: float) -> int:
-    """Decimals that show three significant digits of a value of this size, at least 3."""
-    return max(3, 2 - math.floor(math.log10(size))) if size > 0 else 3
 
 
 def unit_of(axes: Axes) -> str:

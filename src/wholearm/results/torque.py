@@ -78,15 +78,7 @@ class TorqueProfile:
         near = 1e-12 * max(abs(start), abs(stop))
         inner = self.breaks[(self.breaks > start + near) & (self.breaks < stop - near)]
         breaks, degree = np.array([start, *inner, stop]), self.coefficients.shape[2] - 1
-        profile = TorqueProfile.fit(breaks, self.at, degree)
-        # Whole pieces stay as they are to the last bit.
-        first = np.searchsorted(self.breaks, profile.breaks[:-1])
-        first = np.minimum(first, len(self.coefficients) - 1)
-        whole = (self.breaks[first] == profile.breaks[:-1]) & (
-            self.breaks[first + 1] == profile.breaks[1:]
-        )
-        profile.coefficients[whole] = self.coefficients[first[whole]]
-        return profile
+        return TorqueProfile.fit(breaks, self.at, degree)
 
     @staticmethod
     def fit(breaks: Array, function: Callable[[Array], Array], degree: int) -> TorqueProfile:

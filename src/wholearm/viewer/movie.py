@@ -18,6 +18,7 @@ from matplotlib.patches import Polygon
 from PIL import Image, ImageColor
 
 from ..common.arrays import Array
+from ..common.document import fixed
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
@@ -169,7 +170,7 @@ class Movie:
             figure.align_ylabels([margins, torques])
             canvas.draw()
             still = canvas.copy_from_bbox(figure.bbox)
-            decimals = style.count_decimals(motion.duration)
+            form = fixed(min(motion.duration, 0.9))
             look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
             for t in self.times:
                 canvas.restore_region(still)
@@ -178,7 +179,7 @@ class Movie:
                     cursor: Any = {"color": TURNS, "lw": 1.3}
                     cursor["transform"] = axes.get_xaxis_transform()
                     moving.append(style.add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
-                text = f"{problem.name}   t = {t:.{decimals}f} s"
+                text = f"{problem.name}   t = {t:{form}} s"
                 moving.append(figure.text(0.02, 0.975, text, **look))
                 for artist in moving:
                     figure.draw_artist(artist)
