@@ -526,11 +526,11 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     plan = PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
     end, _, outcome = check_plan(phase(4), plan)
     assert outcome == SOLVED and end < 1e-8
-    weak = TorqueProfile(plan.torque.breaks, 0.98 * plan.torque.coefficients)
-    end, *_ = check_plan(phase(4), plan._replace(torque=weak))
+    weak = TorqueProfile(plan.breaks, 0.98 * plan.coefficients)
+    end, *_ = check_plan(phase(4), weak)
     assert end > 1e-3
-    zero = TorqueProfile(plan.torque.breaks, 0.0 * plan.torque.coefficients)
-    _, violation, outcome = check_plan(phase(4), plan._replace(torque=zero))
+    zero = TorqueProfile(plan.breaks, 0.0 * plan.coefficients)
+    _, violation, outcome = check_plan(phase(4), zero)
     assert "contact is lost" in outcome and violation > 0.02
     assert check_plan(phase(4), "stopped")[2] == "stopped"
 

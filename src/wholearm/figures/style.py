@@ -83,7 +83,6 @@ def choose_prefix(size: float) -> tuple[str, float]:
     return next((prefix, factor) for least, prefix, factor in steps if size >= least)
 
 
-
 def unit_of(axes: Axes) -> str:
     """The unit in the label of axes, in brackets."""
     label = axes.get_ylabel()

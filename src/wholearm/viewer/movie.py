@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -121,41 +122,36 @@ def _trace_arc(base: Array, turn: float, radius: float) -> Array:
     return np.asarray(base + radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
+@dataclass(eq=False)
 class Movie:
-    """A motion as pictures.
-
-    A replay, the `ghost`, is drawn behind. The motion passes at `speed` over real time. At a
-    `resolution` in dots per inch it is 8 inches wide.
+    """A motion as pictures, of 8 inches width.
 
     InputError if `speed` is not positive, or makes the movie longer than two minutes.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        trajectory: Trajectory,
-        ghost: Trajectory | None = None,
-        speed: float = 0.1,
-        resolution: int = 90,
-    ) -> None:
-        speed = require_number(speed, "--speed", positive=True)
-        frames = math.ceil(trajectory.duration / speed * FRAMES) + 1
-        most = 120 * FRAMES
+    problem: Problem
+    trajectory: Trajectory
+    ghost: Trajectory | None = None  # a replay, drawn behind
+    speed: float = 0.1  # over real time
+    resolution: int = 90  # dots per inch
+
+    def __post_init__(self) -> None:
+        speed = require_number(self.speed, "--speed", positive=True)
+        duration, most = self.trajectory.duration, 120 * FRAMES
+        frames = math.ceil(duration / speed * FRAMES) + 1
         if frames > most:
-            least = trajectory.duration * FRAMES / most
+            least = duration * FRAMES / most
             text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
             raise InputError("", "--speed", text)
-        self.times = np.linspace(0.0, trajectory.duration, max(2, frames))
-        self._problem, self._trajectory, self._ghost = problem, trajectory, ghost
-        self._resolution = resolution
+        self.times = np.linspace(0.0, duration, max(2, frames))
 
     @exclusive
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
-        problem, motion = self._problem, self._trajectory
-        with style.open_figure(8.0, 7.4, dpi=self._resolution) as figure:
+        problem, motion = self.problem, self.trajectory
+        with style.open_figure(8.0, 7.4, dpi=self.resolution) as figure:
             canvas: Any = figure.canvas
-            scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, motion, self._ghost)
+            scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, motion, self.ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
             draw_margins(margins, motion, problem.epsilon, style.choose_styles(motion.contacts))
