@@ -68,9 +68,10 @@ class ReferenceSettings:
     # Time at rest before the next phase begins [s]: contacts that errors open on arrival close
     # meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
     dwell: float = 25e-3
-    # Squared speeds over the plan's, tried until there is a margin: relative errors of torques
-    # matter less where torques are small. Case: square, phase 2.
-    slower: tuple[float, ...] = (1.0, 0.25)
+    # Squared speeds over the plan's, tried until there is the margin: relative errors of torques
+    # matter less where torques are small. Cases: square, phase 2; hexagon, phase 8; two flips,
+    # phases 8 and 9.
+    slower: tuple[float, ...] = (1.0, 0.5, 0.25)
     slowest: float = 0.1  # least b over the plan's of a motion with a margin: slow ones can stick
     # Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold
     # between its own nodes, so that at others they may be violated a little.
@@ -78,7 +79,7 @@ class ReferenceSettings:
     # Upper limits of the share of all intervals, if some interval has less, as a large share in one
     # interval can reduce that of another one. Case: square, 28 % slower without them.
     parts: tuple[float, ...] = (0.5, 0.2, 0.0)
-    enough: float = 0.4  # least share that needs no smaller upper limit and no slower motion
+    enough: float = 0.95  # least share that needs no smaller upper limit and no slower motion
     widest: float = 0.9  # largest relative range
 
 

@@ -247,13 +247,21 @@ def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
 
 
 def list_aliases(problem: Problem, phase: Phase) -> dict[str, set[str]]:
-    """Contacts of neighbouring features that those of a phase go on from, or go on as."""
+    """Contacts of features that those of a phase go on from, or go on as, one after the other."""
     aliases: dict[str, set[str]] = {name: set() for name in phase.formation.names}
-    for before, after in pairwise(problem.phases[max(phase.index - 1, 0) : phase.index + 2]):
-        formations = before.formation.contacts, after.formation.contacts
-        for old, new in list_renamed(problem.scene, *formations).items():
-            here, there = (new, old) if after is phase else (old, new)
-            aliases[here.name].add(there.name)
+    behind, ahead = problem.phases[: phase.index + 1][::-1], problem.phases[phase.index :]
+    for phases in (behind, ahead):
+        names = {contact: contact.name for contact in phase.formation.contacts}
+        for one, other in pairwise(part.formation.contacts for part in phases):
+            pair = (one, other) if phases is ahead else (other, one)
+            renamed = list_renamed(problem.scene, *pair)
+            if phases is behind:
+                renamed = {new: old for old, new in renamed.items()}
+            names = {
+                renamed[contact]: name for contact, name in names.items() if contact in renamed
+            }
+            for contact, name in names.items():
+                aliases[name].add(contact.name)
     return aliases
 
 
