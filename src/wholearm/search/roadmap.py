@@ -89,16 +89,17 @@ def evaluate_paths(
     formation, limits = _make_limits(scene, epsilon)
     z, z_u, z_uu, kinematics = move(scene, labels, poses, runs)
     directions = Directions.of(kinematics, z_u)
-    try:
-        forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
-    except np.linalg.LinAlgError:
-        wrenches = force_rows(formation, kinematics, directions)[:, :, :3]
-        unheld = np.equal(np.linalg.det(wrenches), 0.0).reshape(-1, 1, 1)
-        kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
-        forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
+    # Rounding makes dependent wrenches independent by a hair (goal 12): a margin tells them.
+    wrenches = force_rows(formation, kinematics, directions)[:, :, :3]
+    wrenches /= [1.0, 1.0, scene.scales.length]
+    sizes = np.linalg.norm(wrenches, axis=2).prod(axis=1)
+    with np.errstate(invalid="ignore"):
+        held = np.asarray(np.abs(np.linalg.det(wrenches)) > 1e-9 * sizes)
+    kinematics = kinematics._replace(A=np.where(held[:, None, None], kinematics.A, np.nan))
+    forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
     rows, cap = PathLimits.of(limits, forces, z_u[:, 3:], GIVE)
     # No motion where three contacts cannot balance the object, or a finger cannot reach it.
-    held = np.asarray(np.isfinite(rows).all(axis=(1, 2)))
+    held &= np.isfinite(rows).all(axis=(1, 2))
     rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])
     return PathLimits(rows, np.where(held, cap, 0.0)).eliminate()
 
