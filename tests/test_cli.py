@@ -114,7 +114,7 @@ def test_solve_writes_samples_and_what_becomes_of_them(
         (["--torques", "a.csv", "--sample-rate", "-5"], "--sample-rate: -5.0 given; allowed"),
         (
             ["--torques", "a.csv", "--sample-rate", "9", "--interpolation", "cubic"],
-            "interpolation: 'cubic' given; allowed are linear and hold",
+            "interpolation: 'cubic' given; allowed are 'linear' and 'hold'",
         ),
         (["--torques", "a.csv", "--sample-rate", "0.01"], "sample_rate: 0.01 Hz given; allowed"),
     ],
@@ -408,7 +408,7 @@ def test_help_shows_every_default() -> None:
 
 def test_shells_complete(capsys: Capture) -> None:
     assert main(["completion", "fish"]) == 2
-    assert "allowed are bash, zsh, tcsh" in capsys.readouterr().err
+    assert "allowed are 'bash', 'zsh', 'tcsh'" in capsys.readouterr().err
     pytest.importorskip("shtab", reason="wholearm[completion] is not installed")
     assert main(["completion", "bash"]) == 0
     text = capsys.readouterr().out

@@ -253,9 +253,9 @@ def run_file(seed: int, number: int) -> dict[str, Any]:
 
     rng, k = np.random.default_rng([seed, number, 1]), (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
-    damage: Callable[[Random, bytes], tuple[str, bytes | None]]
-    damage = (_damage_problem, damage_torques, _damage_archive)[k]
-    what, content = (_damage_bytes if rng.uniform() < 0.25 else damage)(rng, base_files()[k])
+    ways: tuple[Callable[[Random, bytes], tuple[str, bytes | None]], ...]
+    ways = _damage_problem, damage_torques, _damage_archive, _damage_bytes
+    what, content = ways[-1 if rng.uniform() < 0.25 else k](rng, base_files()[k])
     if rng.uniform() < 0.01:
         ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
     rng, (problem, torques, _) = np.random.default_rng([seed, number, 2]), base_files()

@@ -108,8 +108,7 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
         corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
         table = {**table, "object": {**table["object"], "vertices": corners.tolist()}}
         table |= {"start": {"flush": 0, "x": 0.0}, "fingers_collide": False}
-        end = {"x": -0.01}
-        phase = {"contacts": name_first(table), "until": end}
+        phase = {"contacts": name_first(table), "until": {"x": -0.01}}
         problem = build_problem({**table, "phases": [phase]})
         if work == "map":
             build_map(problem)
@@ -120,9 +119,8 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
         solve(build_problem({**table, "phases": phases}), replay=False)
         return
     problem = build_problem({**table, "phases": [first]})
-    goal = "margin" if work == "margin" else "time"
-    duration = 0.4 if work == "margin" else None
-    solve(problem, goal, intervals=size, replay=False, duration=duration)
+    goal: dict[str, Any] = {"objective": "margin", "duration": 0.4} if work == "margin" else {}
+    solve(problem, intervals=size, replay=False, **goal)
 
 
 def fit_exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:

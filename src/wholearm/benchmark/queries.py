@@ -14,6 +14,7 @@ and the processor time over that of planning the printed phases.
 from __future__ import annotations
 
 import argparse
+import math
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -117,16 +118,16 @@ class Queries(Study):
         carried = [*filter(None, (_sum_up(way, solved) for way in WAYS))]
         heads_of_ways = ["", "carried out", "objective off, median:.2g", "most:.2g"]
         heads_of_ways += ["time, median:.2f", "95 %:.2f"]
-        tried = [(row, way, part) for row in rows for way, part in row.get("ways", {}).items()]
         refusals = [
             f"* {row['text']}, {way}: {part['why'][:300]}"
-            for row, way, part in tried
+            for row in rows
+            for way, part in row.get("ways", {}).items()
             if part.get("why")
         ]
-        wrong = [row for row in rows if "findings" in row]
+        told = ["Refused:", "\n".join(refusals)] if refusals else []
         parts: list[str | Table] = [Table(heads, table), "\n".join(lines)]
-        parts.append(Table(heads_of_ways, carried))
-        parts += ["Refused:", "\n".join(refusals)] if refusals else []
+        parts += [Table(heads_of_ways, carried), *told]
+        wrong = [row for row in rows if "findings" in row]
         return parts, [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
 
@@ -140,7 +141,6 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
     objective, printed = answer.plan.options.goal.value, None
     limit = RATE * min(finger.torque_limit for finger in problem.scene.fingers)
     changes: dict[str, dict[str, Any]] = {
-        "time": {},
         "rates": {"torque_rate_limit": limit},
         "period": {"control_period": 2e-3},
         "dwell": {"settle": "10 %"},
@@ -161,8 +161,8 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
                 report = verify_policy(printed.problem, printed.trajectory, policy)
                 part["why"] = "; ".join(report.failures)
             else:
+                changed = printed.problem.with_(changes.get(way, {}))
                 transcription = "time" if way == "time" else "auto"
-                changed = printed.problem.with_(changes[way])
                 plan = solve(changed, objective, transcription=transcription)
                 part["off"] = plan.value / printed.value - 1
         except WholearmError as error:
@@ -179,14 +179,10 @@ def _sum_up(way: str, solved: Sequence[Row]) -> list[Any] | None:
     """How many routes are carried out in a way, how far off, and in which time."""
     parts = [ways for ways in solved if way in ways]
     good = [ways for ways in parts if not ways[way].get("why")]
-    off = [ways[way]["off"] for ways in good if "off" in ways[way]]
-    cells: list[Any] = [way, f"{len(good)} of {len(parts)}", *[None] * 4]
-    if off:
-        cells[2:4] = np.median(off), max(off, key=abs)
-    if good:
-        ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in good]
-        cells[4:] = np.percentile(ratios, [50, 95])
-    return cells if parts else None
+    off = [ways[way]["off"] for ways in good if "off" in ways[way]] or [math.nan]
+    ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in good] or [math.nan]
+    cells = np.median(off), max(off, key=abs), *np.percentile(ratios, [50, 95])
+    return [way, f"{len(good)} of {len(parts)}", *cells] if parts else None
 
 
 def draw_query(seed: int, number: int, folder: Path) -> Problem:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import wholearm
 
 from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
-from ..common.fields import Range, keys_of, read_options
+from ..common.fields import Range, choice, keys_of, read_options
 from ..common.files import require_ending, require_writable, together, write_text
 from ..common.signals import listen, on_end
 from ..mechanics import MARGIN
@@ -250,7 +250,7 @@ problems PROBLEM ...   problem files (TOML), for one hand
     length1=0.1:0.25 base1_x=0.06:0.1 (required)
 --minimise NAME        time, effort or -margin = time among time|effort|-margin
 --symmetric            let what is said of one finger hold for the other, mirrored
---weights W ...        weights of several problems (equal ones)
+--weights W ...        weights of several problems (equal ones) in 1e-6..1e6
 --worst                of several problems let the worst one count, and not the weighted sum
 --starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
 --budget N             most hands of each search, and most until its first feasible one = 80
@@ -1115,9 +1115,7 @@ def read_page(folder: str) -> str:
 
 
 def _completion(options: argparse.Namespace) -> int:
-    shells = ("bash", "zsh", "tcsh")
-    if options.shell not in shells:
-        raise InputError("", "shell", f"{options.shell!r} given; allowed are {', '.join(shells)}")
+    choice("bash", "zsh", "tcsh").read(options.shell, "shell")
     try:
         import shtab
     except ImportError:

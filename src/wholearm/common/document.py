@@ -10,6 +10,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from html import escape
 from importlib import import_module
+from itertools import groupby
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -69,8 +70,7 @@ class Table(NamedTuple):
     # ``"name [unit]:format"``: numbers in SI units, written in that unit (`SCALES`) and format,
     # flush right. Without a format cells are text, flush left.
     columns: Sequence[str]
-    # numbers, several of them for one cell, or text; None and NaN are written as a dash
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Sequence[Any]]  # numbers, several for one cell, or text; None and NaN: a dash
     title: str = ""
     most: int | None = None  # most rows that are rendered as text; the others are counted
 
@@ -97,12 +97,9 @@ class Table(NamedTuple):
     @property
     def cells(self) -> list[list[str]]:
         """The rows as text."""
-        units = [head.rpartition("[")[2].rstrip("]") for head in self.heads]
-        how = [(form, SCALES.get(unit, 1.0)) for form, unit in zip(self.forms, units, strict=True)]
-        return [
-            [show(value, *form_and_scale) for value, form_and_scale in zip(row, how, strict=True)]
-            for row in self.rows
-        ]
+        scales = [SCALES.get(head.rpartition("[")[2].rstrip("]"), 1.0) for head in self.heads]
+        columns = self.forms, scales
+        return [list(map(show, row, *columns)) for row in self.rows]
 
     def to_text(self) -> str:
         """Aligned columns under their names."""
@@ -121,15 +118,11 @@ class Table(NamedTuple):
     def to_html(self) -> str:
         """The table as HTML; cells of text have the class ``text``."""
         looks = ["" if form else ' class="text"' for form in self.forms]
-        lines = [
-            "".join(
-                f"<{kind}{look}>{escape(cell)}</{kind}>"
-                for look, cell in zip(looks, line, strict=True)
-            )
-            for kind, part in (("th", [self.heads]), ("td", self.cells))
-            for line in part
-        ]
-        table = "".join(f"<tr>{line}</tr>" for line in lines)
+        table = ""
+        for kind, line in [("th", self.heads), *(("td", line) for line in self.cells)]:
+            pairs = zip(looks, line, strict=True)
+            cells = "".join(f"<{kind}{look}>{escape(cell)}</{kind}>" for look, cell in pairs)
+            table += f"<tr>{cells}</tr>"
         title = f"<caption>{escape(self.title)}</caption>" if self.title else ""
         return f'<div class="scroll"><table>{title}{table}</table></div>'
 
@@ -145,12 +138,9 @@ class Document(NamedTuple):
     """What a result says."""
 
     title: str  # what it is about
-    # verdict, reason: whether that holds, in a word, and the sentence behind it; empty where
-    # nothing is judged
-    verdict: str = ""
-    reason: str = ""
-    # lines, and tables with what they are called, in the order of reading; empty ones are left out
-    parts: Sequence[str | Table] = ()
+    verdict: str = ""  # whether that holds, in a word; empty where nothing is judged
+    reason: str = ""  # the sentence behind it
+    parts: Sequence[str | Table] = ()  # lines and tables; empty ones are left out
 
     @property
     def head(self) -> str:
@@ -164,14 +154,12 @@ class Document(NamedTuple):
 
     def to_text(self) -> str:
         """Lines of text, with an empty one above and below tables."""
-        blocks, lines = list[str](), [self.head] if self.head else []
-        for part in self.shown:
-            if isinstance(part, str):
-                lines.append(part)
-                continue
-            blocks += ["\n".join(lines)] if lines else []
-            blocks, lines = [*blocks, part.to_text()], []
-        return "\n\n".join([*blocks, *(["\n".join(lines)] if lines else [])])
+        parts = [self.head, *self.shown] if self.head else self.shown
+        blocks = list[str]()
+        for is_text, group in groupby(parts, lambda part: isinstance(part, str)):
+            texts = [part if isinstance(part, str) else part.to_text() for part in group]
+            blocks += ["\n".join(texts)] if is_text else texts
+        return "\n\n".join(blocks)
 
     def to_markdown(self) -> str:
         """A page of Markdown."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -79,15 +79,9 @@ class Shortfall(NamedTuple):
 
 
 class WholearmError(Exception):
-    """Base of every error that this package raises on purpose.
+    """Base of every error that this package raises on purpose."""
 
-    Attributes
-    ----------
-    exit_status  exit status of the command line: 1 when the task cannot be done, 2 when the input
-                 is bad
-    """
-
-    exit_status = 1
+    exit_status = 1  # of the command line: 1 if the task cannot be done, 2 if the input is bad
 
 
 class InputError(WholearmError):
@@ -165,8 +159,7 @@ class _PhaseError(WholearmError):
 class JammingError(_PhaseError):
     """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
 
-    # changes of a single coefficient of friction with which a plan was found
-    changes: tuple[Change, ...] = ()
+    changes: tuple[Change, ...] = ()  # of one coefficient of friction, with which a plan was found
 
 
 class AmbiguityError(JammingError):
@@ -231,10 +224,9 @@ def suggest(name: str, known: Iterable[str]) -> str:
 def read_share(value: str, key: str) -> float:
     """What a text such as "10 %" says, as a fraction, or raise `InputError` naming `key`."""
     number, sign, rest = value.partition("%")
-    try:
+    share = math.nan
+    with suppress(ValueError):
         share = float(number) / 100 if sign and not rest.strip() else math.nan
-    except ValueError:
-        share = math.nan
     if not 1e-4 <= share <= 1:
         raise InputError("", key, f'{value!r} given; allowed as a share is "0.01 %" to "100 %"')
     return share

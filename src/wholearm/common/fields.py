@@ -12,6 +12,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from numbers import Real
@@ -38,8 +39,7 @@ class Range:
 
     low: float  # low, high: as multiples of the scale, where there is one
     high: float
-    # of the scene and of what has the number; None where the range does not count
-    scale: Callable[[Any, Any], float | None] | None = None
+    scale: Callable[[Any, Any], float | None] | None = None  # of scene and owner; None: no range
     of: str = ""  # what messages call the scale; ``{time}`` stands for the scene's time
 
     @property
@@ -75,16 +75,14 @@ class Range:
             raise InputError("", key, text)
         return value if self.whole else float(value)
 
-    def parse(self, text: str) -> float:
+    def parse(self, text: str) -> Any:
         """The value of a command-line option."""
-        value: float | str
-        try:
+        value: Any = text
+        with suppress(ValueError):
             value = int(text) if self.whole else float(text)
-        except ValueError:
-            value = text
         if wrong := self.find_fault(value):
             raise argparse.ArgumentTypeError(wrong)
-        return value  # type: ignore[return-value]
+        return value
 
     def check(
         self, key: str, given: Any, unit: str = "", scene: Any = None, owner: Any = None

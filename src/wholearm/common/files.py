@@ -46,11 +46,7 @@ def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
     """Write a file through a temporary one beside it, renamed when complete, or an `InputError`.
 
-    Parameters
-    ----------
-    path   where the file is to appear; an existing file is replaced, and what is not a file (a
-           device, a pipe) is written to
-    write  receives the open binary file
+    An existing file is replaced, and what is not a file (a device, a pipe) is written to.
     """
     target = os.fspath(path)
     try:

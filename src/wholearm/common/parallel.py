@@ -239,12 +239,8 @@ def run_all(
 ) -> Iterator[tuple[Any, Any]]:
     """Each task and what `run` returns for it, or the exception that it raises, as they end.
 
-    Parameters
-    ----------
-    run       of a module, as workers import it by name
-    tasks     arguments of `run`; have to be picklable
-    executor  shut down at the end
-    ahead     largest number of tasks that are submitted at a time
+    `run` is of a module, as workers import it by name; tasks have to be picklable. The executor is
+    shut down at the end. No more than `ahead` tasks are submitted at a time.
     """
     waiting, pending = iter(tasks), dict[Future[Any], Any]()
     try:
@@ -266,14 +262,9 @@ def run_all(
 class Processes(ThreadPoolExecutor):
     """Spawned processes, each led by a thread. One that dies or hangs costs its own task alone.
 
+    There are as many as `jobs`, or cores. A task may take `limit` of processor time [s], and 20
+    times that by the wall clock, as others may run too. Tasks that run `alone` have new processes.
     Futures raise `DiedError` where a task loses its process three times, or its time is up.
-
-    Parameters
-    ----------
-    jobs   number of processes; as many as cores if left out
-    limit  processor time that a task may take [s]. By the wall clock it may take 20 times that, as
-           others may run too.
-    alone  whether each task has a new process, where nothing is kept from others
     """
 
     def __init__(

@@ -220,7 +220,7 @@ def design_hand(
     minimise: str = "time",
     *,
     symmetric: bool = False,
-    weights: Sequence[float | str] = (),
+    weights: Sequence[float] = (),
     worst: bool = False,
     starts: int = 3,
     budget: int = 80,
@@ -247,10 +247,7 @@ def design_hand(
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     choice("time", "effort", "-margin").read(minimise, "--minimise")
-    try:
-        given = np.array([float(weight) for weight in weights] or np.ones(len(listed)))
-    except ValueError:
-        given = np.zeros(0)
+    given = np.array(weights or np.ones(len(listed)), dtype=float)
     if len(given) != len(listed) or not (given > 0).all():
         text = f"{weights} given; {len(listed)} positive numbers are needed, one for each problem"
         raise InputError("", "--weights", text)

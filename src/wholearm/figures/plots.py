@@ -204,9 +204,8 @@ def draw_phases(
 
     Numbers of phases too short for them stand above the axes in two rows.
 
-    `starts` holds when each phase starts and the last one ends, shape (n_phases + 1,) [s]. The axes
-    must be at their final place, which decides what there is room for; they cover `span` [s], or
-    just the phases.
+    `starts` are those of phases, and the last end, (n_phases + 1,) [s]; the axes cover `span` [s],
+    or the phases, and are at their final place, which decides what there is room for.
     """
     points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
     taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
@@ -243,13 +242,11 @@ def force_margins(
     Parameters
     ----------
     what          planned, replayed or loaded; its `meta` must hold the problem's tables
-    simulation    a replay of the same torques, drawn over it with dotted lines; its contacts must
-                  be those of the trajectory, in that order
+    simulation    a replay of the same torques and contacts, drawn over it with dotted lines
     width : [in]  of the figure, 3 to 40. Below 7 legends stand at the foot.
     motion        whether to draw the object's pose, and the joints' angles and speeds, too
 
-    Axes are in the order: snapshots from left to right, margins, torques, the friction cones if a
-    contact rolls, and pose, angles and speeds.
+    Axes are in the order: snapshots, margins, torques, cones, pose, angles and speeds.
 
     InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
     range.

@@ -37,11 +37,10 @@ def draw_snapshot(
     styles: Styles,
     box: Array | None = None,
 ) -> list[Artist]:
-    """Draw palm, links, object with numbered vertices, and contacts, to scale.
+    """Draw palm, links, object with numbered vertices, and contacts, on axes in m without a frame.
 
-    The configuration `z` has shape (5,) [m, m, rad, rad, rad]; the axes lose their frame, and
-    their unit is 1 m. They show `box`, lower left and upper right corner, shape (2, 2) [m], or
-    everything. Returns palm, link 1, link 2, object, and one marker per contact.
+    They show `box`, lower left and upper right corner, shape (2, 2) [m], or everything at the
+    configuration `z`, (5,). Returns palm, link 1, link 2, object, and one marker per contact.
     """
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="datalim")

@@ -55,8 +55,7 @@ class ModeGuess(NamedTuple):
     t: float  # [s]: from the start of the phase
     x: float  # [m]
     phi: float  # [rad]
-    # of the sliding velocities of the contacts, 0 if one rolls, and of the joint velocities
-    signs: tuple[float, ...]
+    signs: tuple[float, ...]  # of sliding velocities, 0 if a contact rolls, and joint velocities
 
 
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
@@ -85,8 +84,7 @@ class Until:
     contact: Contact | None = None  # the contact that is gained
     coordinate: str = ""  # {"", "x", "phi"}: the coordinate, when there is one
     value: float | None = None  # [m] or [rad]
-    # [m] or [rad]: coordinates of the pose, and the values that they have there, too
-    pins: tuple[tuple[str, float], ...] = ()
+    pins: tuple[tuple[str, float], ...] = ()  # other coordinates, and their values [m] or [rad]
 
     @property
     def coordinates(self) -> tuple[tuple[str, float], ...]:
@@ -234,18 +232,14 @@ class Problem:
     scene: Scene
     epsilon: float
     start: Array  # (5,): configuration z at the start, with the fingers closed; see `place_start`
-    # none of them for a map, or where there are goals; replays need one or more
-    phases: tuple[Phase, ...]
+    phases: tuple[Phase, ...]  # none for a map, or with goals; replays need one or more
     source: str = ""  # the file this was read from
-    # half widths of the ranges of what is not known exactly, by name; those that are left out have
-    # their defaults, see `PARAMETERS`. None where the problem does not say.
+    # half widths of ranges by name, by default those of `PARAMETERS`; None if it does not say
     uncertainty: Mapping[str, float] | None = None
-    # whether it is known to be like one from a file; otherwise it is checked when it is made
-    checked: bool = field(default=False, repr=False)
+    checked: bool = field(default=False, repr=False)  # if not, it is checked when it is made
     settle: float | str = 0.0
     settle_gap: float | None = None
-    # where the object shall come to lie, one after the other, in place of phases
-    goals: tuple[Goal, ...] = ()
+    goals: tuple[Goal, ...] = ()  # where the object shall come to lie, in place of phases
 
     def __post_init__(self) -> None:
         phases = tuple(
@@ -265,10 +259,7 @@ class Problem:
 
     @cached_property
     def table(self) -> Mapping[str, Any]:
-        """The problem as the nested tables of a file, which trajectory files carry along.
-
-        Empty where no file can say it: the start has no edge flush on the palm, or an open finger.
-        """
+        """The problem as the nested tables of a file, empty if none can say it: `write_table`."""
         from .table import write_table
 
         return write_table(self)
@@ -314,10 +305,7 @@ class Problem:
         return read_share(self.settle, "settle") if isinstance(self.settle, str) else 0.0
 
     def settles(self, phase: Phase) -> float | None:
-        """For how long the end of a phase is held, if it comes to rest there [s].
-
-        None where that is shared out.
-        """
+        """For how long the end of a phase at rest is held [s]; None where that is shared out."""
         if phase.settle is None:
             return None if isinstance(self.settle, str) else self.settle
         return phase.settle

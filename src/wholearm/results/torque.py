@@ -14,9 +14,10 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
+from ..common.fields import choice
 
 ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
-INTERPOLATIONS = ("linear", "hold")
+
 _PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece of torques at which it is looked at
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 COMMANDS = ("command1", "command2")
@@ -243,9 +244,7 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
 
 def require_sampling(rate: object, interpolation: str) -> float:
     """The rate [Hz] as a number; an `InputError` if it or the interpolation is not allowed."""
-    if interpolation not in INTERPOLATIONS:
-        allowed = " and ".join(INTERPOLATIONS)
-        raise InputError("", "interpolation", f"{interpolation!r} given; allowed are {allowed}")
+    choice("linear", "hold").read(interpolation, "interpolation")
     return require_number(rate, "sample_rate", positive=True)
 
 

@@ -22,10 +22,7 @@ from ..verification.newton_euler import locate
 
 
 def build_page(title: str, parts: Iterable[str]) -> str:
-    """A page of HTML with the style and the scripts that its parts need.
-
-    `parts` are made by the other functions of this module.
-    """
+    """A page of HTML of `parts`, as other functions of this module make them, with their script."""
     folder = resources.files(__package__)
     style, script = (folder.joinpath(f"viewer.{kind}").read_text("utf-8") for kind in ("css", "js"))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -82,14 +79,7 @@ class Pushes(NamedTuple):
 def describe_motion(
     trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = 4000
 ) -> dict[str, Any]:
-    """Everything that a page needs to play a motion, as plain values.
-
-    Parameters
-    ----------
-    problem  its scene and epsilon
-    ghost    another motion of the same hand, drawn behind: a replay
-    most     about as many samples are taken at most
-    """
+    """What a page needs to play a motion, of `most` samples or so, with a replay behind it."""
     scene, pushes = problem.scene, Pushes.of(problem.scene, trajectory)
     styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)

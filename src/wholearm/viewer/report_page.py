@@ -41,15 +41,10 @@ def build_report(
     chart: FormationMap | None = None,
     sensitivities: bool = False,
 ) -> str:
-    """Put plans and torques for a problem, replayed, into one page of HTML.
+    """Put the plans (.npz) and torques (.csv) at `paths`, replayed, into one page of HTML.
 
-    Parameters
-    ----------
-    paths     trajectory files (.npz) and torques (.csv)
-    text      the problem file as it stands
-    progress  called with what is being done
-    chart     the map of the problem, if it is there already
-    sensitivities  whether to add what 1 % more of each number is worth
+    It has the `text` of the problem file, a map, `chart` if it is there already, and, with
+    `sensitivities`, what 1 % more of each number is worth.
 
     InputError if a file cannot be read, or is one of another problem; names the file.
     """
