@@ -24,12 +24,12 @@ from plane import (
     unbalance,
 )
 from planned import forward
+from resting import list_others, rest_margin
 from scenes import box, read_lines, roll, tipped
 from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from timed import landing, plan_landing
 from wholearm import Formation, InputError, PlanOptions, TorqueProfile, verify
 from wholearm import solve as plan
-from wholearm.benchmark.refusals import list_others, rest_margin
 from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
