@@ -42,14 +42,14 @@ from ..contacts.formation import Formation
 from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
 from ..geometry.tracing import trace_phases
-from ..mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, build_forward, inverse
+from ..mechanics.dynamics import ONE, A, B, build_force_rows, build_forward, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
 from ..planning.lower_bound import bound_least_time
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
-from ..planning.path_domain.path_motion import PathMotion
+from ..planning.path_domain.path_motion import NODES, PathMotion, Profile, lay_out
 from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp, guess
 from ..planning.path_domain.path_plan import plan_path
 from ..planning.time_domain.time_plan import plan_phases
@@ -471,12 +471,12 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
     return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
 
 
-def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
-    """Forces and limits at places of a curve, whose segments are `owner`."""
+def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> PathLimits:
+    """Limits at places of a curve, whose segments are `owner`."""
     curve, point = instance.curve, instance.curve.evaluate(s)
     forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
     limits = make_limits(curve.formation, instance.problem.epsilon)
-    return forces, PathLimits.of(limits, forces, point.z_s[:, 3:])
+    return PathLimits.of(limits, forces, point.z_s[:, 3:])
 
 
 def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
@@ -494,8 +494,7 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
         grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
         grid.sort()
     stops = [part.stop for part in instance.curve.segments[:-1]]
-    _, limits = _limit(instance, grid, np.searchsorted(stops, grid))
-    rows = limits.eliminate().rows
+    rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
     constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
@@ -539,24 +538,19 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
             for part, middle in ((grid, stop), (speeds, speed))
         )
     steps, b = np.diff(grid), speeds**2
-    a = np.diff(b) / (2 * steps)
-    times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
-    owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
+    a, owner = np.diff(b) / (2 * steps), np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
     ends = [
-        np.mean(_limit(instance, grid[p], owner)[1].find_internal_force_range(a, b[p]), axis=0)
+        np.mean(_limit(instance, grid[p], owner).find_internal_force_range(a, b[p]), axis=0)
         for p in (slice(-1), slice(1, None))
     ]
-
-    def torque(t: Array) -> Array:
-        k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(a) - 1)
-        local = t - times[k]
-        run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
-        part = run / steps[k]
-        internal = ends[0][k] * (1 - part) + ends[1][k] * part
-        forces, _ = _limit(instance, grid[k] + run, owner[k])
-        return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
-
-    return TorqueProfile.fit(times, torque, 4)
+    elements = lay_out(np.column_stack([grid[:-1], grid[1:]]), owner, (True, True))
+    each = np.repeat(np.arange(len(steps)), NODES)
+    part = (elements.s - grid[each]) / steps[each]
+    internal = ends[0][each] * (1 - part) + ends[1][each] * part
+    profile = Profile(a[each], np.interp(elements.s, grid, b), internal)
+    motion = PathMotion(instance.curve, elements, profile)
+    breaks = np.append(motion.times[::NODES], motion.duration)
+    return TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, 4)
 
 
 def build_yapss(instance: Instance, setting: str) -> Callable[[], Plan]:

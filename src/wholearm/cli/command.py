@@ -520,35 +520,26 @@ LoadedPlan = tuple[
 
 
 def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> LoadedPlan:
-    """The problem with the phases of a plan, the plan, its policy if any, and `tell_origin`."""
+    """The problem with the phases of a plan, the plan, its policy if any, and notes for JSON.
+
+    The `notes`, if there are any, say what was made for another problem; they are printed unless
+    `silent`. InputError, with the file, if a plan or policy makes no sense here.
+    """
     from ..problem.read import adopt_phases
+    from ..results.adopt import describe_origin
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
     policy_path, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
     if policy_path is not None:
         policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
         origins.append(("policy", policy_path, policy.about))
-    problem = adopt_phases(problem, plan.meta, plan.q[-1], path)
-    return problem, plan, policy, tell_origin(problem, *origins, silent=silent)
-
-
-def tell_origin(
-    problem: wholearm.Problem, *origins: tuple[str, str, Mapping[str, Any]], silent: bool = False
-) -> dict[str, list[str]]:
-    """Print, unless `silent`, and return a line for what was made for another problem.
-
-    Origins are what it is, its file, and what that says about it. The lines are the `notes`, for
-    JSON; without any the dict is empty. InputError, with the file, if one makes no sense here.
-    """
-    from ..results.adopt import describe_origin
-
-    notes: list[str] = []
+    problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
     for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
     for note in () if silent else notes:
         print(note)
-    return {"notes": notes} if notes else {}
+    return problem, plan, policy, {"notes": notes} if notes else {}
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -829,10 +820,9 @@ def _map(options: argparse.Namespace) -> int:
             return 0
     output = options.output or f"map_{Path(options.problem).stem}.png"
     require_output(output)
-    problem = read_problem(options)
-    plan = None if options.plan is None else wholearm.load_trajectory(options.plan)
-    if plan is not None:
-        tell_origin(problem, ("plan", options.plan, plan.meta), silent=bool(poses))
+    problem, plan = read_problem(options), None
+    if options.plan is not None:
+        problem, plan, *_ = load_plan(options, options.plan, bool(poses))
     _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
     print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
