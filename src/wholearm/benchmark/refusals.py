@@ -504,23 +504,11 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     first = project_end(z) if first is None else first
     if first is None:
         return np.zeros((0, 5))
-    scale = np.sqrt(weights(scene))
-    ends = [first]
-    for way in () if phase.until.pins else (1.0, -1.0):
-        here, ahead = first, None
-        for step in 0.08 * scene.scales.length * 1.12 ** np.arange(16):
-            rows = _end_equations(scene, phase, here)[1] / scale
-            tangent = np.linalg.svd(rows)[2][-1] / scale
-            if ahead is None:
-                tangent = way * tangent
-            elif (tangent * scale) @ (ahead * scale) < 0:
-                tangent = -tangent
-            after = project_end(here + step * tangent)
-            if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
-                break
-            here, ahead = after, tangent
-            ends.append(here)
-    points = np.array(ends)
+    scale, far = np.sqrt(weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
+    tangent = np.linalg.svd(_end_equations(scene, phase, first)[1] / scale)[2][-1] / scale
+    steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
+    others = [project_end(first + step * tangent) for step in steps]
+    points = np.array([first, *(end for end in others if end is not None)])
     return points[inside(scene, phase, points)]
 
 
