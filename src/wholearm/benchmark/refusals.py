@@ -546,26 +546,20 @@ def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
     u = np.linspace(0.0, 1.0, 40)[:, None]
     shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
     poses = np.einsum("uk,nkd->nud", shares, controls)
-    curves = np.repeat(z[None], len(controls), axis=0)[:, None].repeat(len(u), axis=1)
+    curves = np.tile(z, (*poses.shape[:2], 1))
     for k in range(1, len(u)):
-        guess = curves[:, k - 1].copy()
-        guess[:, [0, 2]] = poses[:, k]
-        curves[:, k] = place(scene, phase, guess, curves[:, k - 1])
+        # Newton's method for y and the joints, from the place before.
+        place = curves[:, k - 1].copy()
+        place[:, [0, 2]] = poses[:, k]
+        for _ in range(6):
+            gaps, rows = constrain(scene, phase, place)
+            rows = rows[:, :, [1, 3, 4]]
+            flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
+            rows[flat] = np.eye(3)
+            step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
+            place[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
+        curves[:, k] = place
     return curves
-
-
-def place(scene: Scene, phase: Phase, z: Array, before: Array) -> Array:
-    """Configurations with the x and phi of `z` that keep the contacts, coming from `before`."""
-    z = z.copy()
-    z[:, [1, 3, 4]] = before[:, [1, 3, 4]]
-    for _ in range(6):
-        gaps, rows = constrain(scene, phase, z)
-        rows = rows[:, :, [1, 3, 4]]
-        flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
-        rows[flat] = np.eye(3)
-        step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
-        z[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
-    return z
 
 
 def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
@@ -592,13 +586,9 @@ def _find_margin(scene: Scene, phase: Phase, epsilon: float, z: Array) -> float:
 def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     """What is missing to contacts and end at one configuration, and its rows."""
     (gaps,), (rows,) = constrain(scene, phase, z[None])
-    until = phase.until
-    places = dict(until.poses)
-    if until.contact is not None:
-        touch = locate(scene, until.contact.name, z[None])
+    places, contact = dict(phase.until.poses), phase.until.contact
+    if contact is not None:
+        touch = locate(scene, contact.name, z[None])
         gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
-    elif not places:
-        k = 2 if until.coordinate == "phi" else 0
-        places = {k: z[k]}
     missing = [z[k] - value for k, value in places.items()]
     return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])
