@@ -26,6 +26,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from enum import Enum
 from functools import lru_cache
 from operator import itemgetter
 from typing import Any, NamedTuple, NoReturn, cast
@@ -164,35 +165,14 @@ def _build_leg(
     return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
 
 
-class Arrival(NamedTuple):
-    """The end of a phase is reached."""
+class Stop(Enum):
+    """How a motion ends without an outcome."""
 
-    rate: float  # [m/s or rad/s]: how fast the distance to the phase's end closes
-    # [s]: if the next break of the torques is no further off, the arrival belongs to it
-    window: float
-    strikes: bool = False  # whether it takes an impact to go on
-    # [s]: time in which a motion whose deceleration fades would have come to rest
-    remaining: float = 0.0
+    PHASE = "the end of the phase is reached"
+    REST = "the object comes to rest"
 
 
-class Released(NamedTuple):
-    """The contacts that the next phase does not have are let go."""
-
-    c_n: float  # [N]: the least that the old formation would need of them
-
-
-class Switched(NamedTuple):
-    """A contact comes to rest, or slips, as the next phase has it."""
-
-    contact: str
-    sign: float = 0.0  # direction in which it slips; 0 if it comes to rest
-
-
-class Rested:
-    """The motion has come to rest."""
-
-
-Ending = Arrival | Released | Switched | Rested | Outcome
+Ending = Stop | Outcome
 
 
 class Replay(Run):
@@ -213,6 +193,7 @@ class Replay(Run):
 
     leg: ModeSegment
     phase: Phase
+    following: Phase | None  # the next phase
     least: Array
     releasable: tuple[str, ...]  # the contacts whose release ends the phase
     # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
@@ -311,9 +292,26 @@ class Replay(Run):
         self.note(EventKind.CONTACT_LOST, text, contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
-    def fail_by_slip(self, row: int, c_n: float, c_t: float) -> Outcome:
-        """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
+    def release(self, c_n: float) -> Stop:
+        """End the phase as the next one lets contacts go; the least that they would need [N]."""
+        names = ", ".join(self.releasable)
+        self.note(EventKind.RELEASE, f"{names} released {self.when()}", names, c_n)
+        self.moving = True
+        return Stop.PHASE
+
+    def switch(self, contact: str, sign: float = 0.0) -> Stop:
+        """End the phase as a contact slips with a `sign`, or comes to rest, as in the next one."""
+        text = f"{contact} {'slips' if sign else 'comes to rest'} {self.when()}"
+        self.note(EventKind.ARRIVAL, text, contact)
+        self.slip_signs = {contact: sign} if sign else {}
+        self.moving = True
+        return Stop.PHASE
+
+    def fail_by_slip(self, row: int, c_n: float, c_t: float) -> Ending:
+        """End because a rolling contact, the `row`-th, slips under forces in N: by plan, or not."""
         name, bound = self.formation.names[row], self.formation.friction[row] * c_n
+        if row in self.slipping:
+            return self.switch(name, -math.copysign(1.0, c_t))
         how = "exceeds" if abs(c_t) - bound > 1e3 * self.rounding else "reaches"
         text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
         self.note(EventKind.SLIP, text, name, bound - abs(c_t))
@@ -366,62 +364,46 @@ class Replay(Run):
     def _play(self, phase: Phase, following: Phase | None) -> Outcome | None:
         """Simulate one phase; None if its end is reached."""
         self.enter(phase, following)
-        ending: StartDeparture | Ending = Rested()
+        ending: Ending = Stop.REST
         if self.moving:
             ending = self.go_on() or self.move()
-        while isinstance(ending, Rested | StartDeparture):
-            if isinstance(ending, Rested):
-                ending = self._rest()
-            if isinstance(ending, StartDeparture):
-                if not self.gets_on():
-                    raise SimulationError(f"starting and stopping do not end {self.when()}")
-                self.note(EventKind.START, f"the object starts to move {self.when()}")
-                self.set_off(ending)
-                ending = self.move()
-        if isinstance(ending, Outcome):
-            return ending
-        if isinstance(ending, Arrival):
-            return self._arrive(ending, following)
-        if isinstance(ending, Released):
-            names = ", ".join(self.releasable)
-            self.note(EventKind.RELEASE, f"{names} released {self.when()}", names, ending.c_n)
-        else:
-            contact, sign = ending
-            text = f"{contact} {'slips' if sign else 'comes to rest'} {self.when()}"
-            self.note(EventKind.ARRIVAL, text, contact)
-            self.slip_signs = {contact: sign} if sign else {}
-        self.moving = True
-        return None
+        while ending is Stop.REST:
+            ending = self._rest()
+        return ending if isinstance(ending, Outcome) else None
 
-    def _arrive(self, arrival: Arrival, following: Phase | None) -> Outcome | None:
-        """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
-        until, rate = self.phase.until, arrival.rate
-        self.note(EventKind.ARRIVAL, f"{until} reached {self.when()}", str(until), rate)
-        if arrival.strikes and following is not None:
+    def _arrive(self, window: float) -> Ending:
+        """End the phase; if it ends at rest the motion stops, with a plastic impact if need be.
+
+        If the next break of the torques is within the `window` [s], the arrival belongs to it.
+        """
+        until, following = self.phase.until, self.following
+        self.note(EventKind.ARRIVAL, f"{until} reached {self.when()}", str(until), -self.rate)
+        if self._strikes() and following is not None:
             self.moving = True
-            return self.collide(following)
+            return self.collide(following) or Stop.PHASE
         self.moving = self.phase.end is End.SMOOTH
         if self.moving:
-            return None
+            return Stop.PHASE
+        remaining = self._find_remaining()
         self.set_velocity(0.0)
         # The torques of the phase that has ended go on until they step, or end.
         coming = min(self.coming_step, self.breaks[-1])
-        self.held_until = coming if coming - self.t <= arrival.window else self.t
+        self.held_until = coming if coming - self.t <= window else self.t
         if self.problem.scene.has_slow_motors:
             # Rate-limited torques do not step. A motion whose deceleration fades comes early by
             # about the cube root of its error: the old torques act until it was to end.
-            remaining = arrival.remaining if self.breaks[self.piece] < self.t < self.stop else 0.0
+            remaining = remaining if self.breaks[self.piece] < self.t < self.stop else 0.0
             self.held_until = max(self.held_until, min(self.t + remaining, self.breaks[-1]))
             self.settled_by = self.held_until + self.rest_window
-        return None
+        return Stop.PHASE
 
-    def _rest(self) -> StartDeparture | Arrival | Released | Switched | Outcome:
-        """Wait at rest until the formation can start, the goal is near or balance is lost."""
+    def _rest(self) -> Ending:
+        """Wait until the formation starts, and move; or the goal is near, or balance is lost."""
         self.set_velocity(0.0)
         self.look()
         self.record(still=True)
         if self.is_there():
-            return Arrival(0.0, self.rest_window)
+            return self._arrive(self.rest_window)
         rest = find_rest(self.formation, self.z)
         sticks = False
         while True:
@@ -431,13 +413,13 @@ class Replay(Run):
                 x = min(1.0, max(-1.0, self.fraction(self.t)))
                 change = rest.wait(self.torque.coefficients[self.piece], x)
                 if isinstance(change, StartDeparture) and change.x <= x:
-                    return change
+                    return self.set_off(change)
                 if not sticks:
                     self.note(EventKind.STICK, f"the object sticks {self.when()}")
                 sticks = True
                 if isinstance(change, StartDeparture):
                     self.wait(self.time(change.x))
-                    return change
+                    return self.set_off(change)
                 if isinstance(change, Collapse):
                     # Balance may be lost where the torques are about to step or to be the next
                     # phase's.
@@ -450,7 +432,7 @@ class Replay(Run):
                 self.wait(self.stop)
                 self.next_piece()
 
-    def _collapse(self, change: Collapse) -> Released | Switched | Outcome:
+    def _collapse(self, change: Collapse) -> Ending:
         """End because nothing balances at rest."""
         self.wait(max(self.t, self.time(change.x)))
         if change.jammed:
@@ -460,11 +442,9 @@ class Replay(Run):
             )
         if change.c_t is not None:
             row = self.formation.names.index(change.contact)
-            if row in self.slipping:
-                return Switched(change.contact, -math.copysign(1.0, change.c_t))
             return self.fail_by_slip(row, change.c_n, change.c_t)
         if change.contact in self.releasable:
-            return Released(change.c_n)
+            return self.release(change.c_n)
         return self.lose(change.contact, change.c_n)
 
     def move(self) -> Ending:
@@ -572,12 +552,11 @@ class Replay(Run):
     def pass_break(self) -> Ending | None:
         """Go on to the next piece of the torques."""
         if self._is_at_end(self.t):
-            rate, strikes, remaining = -self.rate, self._strikes(), self._find_remaining()
             # Before a step that is still to come, the torques are those of the phase that ends.
             stepped = self.next_piece() and self.steps_at[self.piece]
             # Phase 10 of query 32 is there two breaks before its end.
-            window = self.settling if stepped else max(self.rest_window, remaining)
-            return Arrival(rate, window, strikes)
+            longest = max(self.rest_window, self._find_remaining())
+            return self._arrive(self.settling if stepped else longest)
         if self.t >= self.breaks[-1]:
             return self.run_out()
         self.next_piece()
@@ -611,13 +590,10 @@ class Replay(Run):
             return self._reach()
         return self.restart(turning)
 
-    def _reach(self) -> Arrival:
+    def _reach(self) -> Ending:
         """The end of the phase is reached while moving."""
-        rate, window = -self.rate, self.settling
-        if self.phase.end is End.SMOOTH or self._strikes():
-            return Arrival(rate, window, self.phase.end is End.IMPACT)
-        remaining, slow = self._find_remaining(), abs(self._measure_rate()) < SLOW
-        return Arrival(rate, max(remaining, window) if slow else remaining, remaining=remaining)
+        slow = abs(self._measure_rate()) < SLOW
+        return self._arrive(max(self._find_remaining(), self.settling if slow else 0.0))
 
     def _find_remaining(self) -> float:
         """Longest time to the end of a planned motion that is there early by its error [s].
@@ -652,6 +628,7 @@ class Replay(Run):
         formation, old = phase.formation, self.system.stored(self.z, self.v)
         until = phase.until.lead(self.z, self.system.scales.length)
         self.phase, self.phase_index = replace(phase, until=until), phase.index
+        self.following = following
         self.y[:5] = self._close(formation)
         self.impact += float(old - self.system.stored(self.z, self.v))
         self.project_velocity(formation.evaluate(self.z[None], self.v[None]).P[0])
@@ -706,8 +683,11 @@ class Replay(Run):
         self.set_velocity(impact.v)
         return None
 
-    def set_off(self, departure: StartDeparture) -> None:
-        """Set the friction signs of a motion that starts from rest."""
+    def set_off(self, departure: StartDeparture) -> Ending:
+        """Move from rest, with the friction signs of the start."""
+        if not self.gets_on():
+            raise SimulationError(f"starting and stopping do not end {self.when()}")
+        self.note(EventKind.START, f"the object starts to move {self.when()}")
         formation, signs = self.formation, departure.signs
         mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
@@ -716,6 +696,7 @@ class Replay(Run):
             self.stuck = {row for row in gripped if fixed[row]}
         self.start_with(mode, signs, departure.heading)
         self.observe()
+        return self.move()
 
     def start_with(self, mode: Mode, signs: Array, heading: Array) -> None:
         """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
@@ -812,14 +793,14 @@ class Replay(Run):
             self.stuck = (self.stuck - set(unit.rows)) | set(() if after else unit.rows)
         return False
 
-    def come_to_rest(self) -> Rested | Switched:
+    def come_to_rest(self) -> Stop:
         """End all motion, and the phase if a contact was to come to rest."""
         if not self.is_there():
             self.note(EventKind.REST, f"the object comes to rest {self.when()}")
-        return self._hold() if self.resting else Rested()
+        return self._hold() if self.resting else Stop.REST
 
-    def _hold(self) -> Switched:
-        return Switched(", ".join(self.formation.names[row] for row in sorted(self.resting)))
+    def _hold(self) -> Stop:
+        return self.switch(", ".join(self.formation.names[row] for row in sorted(self.resting)))
 
     def _drop_repeated(self) -> None:
         """Take back forces after a jump that are those of a formation that is given up."""
@@ -828,30 +809,28 @@ class Replay(Run):
         if same and self.t - last[0].t <= self.settling:
             self.records.pop()
 
-    def let_go(self, contacts: Sequence[int]) -> Released | Outcome:
+    def let_go(self, contacts: Sequence[int]) -> Ending:
         """End as contacts would have to pull: a release if that is planned of one of them."""
         names = self.formation.names
         forces = dict(zip(names, self.s.outputs[self.s.to.c_n].tolist(), strict=True))
         pulling = [names[k] for k in contacts]
         if any(name in self.releasable for name in pulling):
             self._drop_repeated()
-            return Released(min(forces[name] for name in self.releasable))
+            return self.release(min(forces[name] for name in self.releasable))
         name = min(pulling, key=forces.__getitem__)
         return self.lose(name, min(0.0, forces[name]))
 
-    def slip(self) -> Released | Switched | Outcome:
+    def slip(self) -> Ending:
         """End because a rolling contact slips, or starts to part where its release is planned."""
         s, holders, reserves = self.s, self.leg.mode.holders, self._measure_reserves()
         out = [k for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE]
         planned = [k for k in out if holders[k][0] in self.slipping]
         row = holders[min(planned or reserves, key=reserves.__getitem__)][0]
-        name = self.formation.names[row]
-        if name in self.releasable:
+        if self.formation.names[row] in self.releasable:
             return self.let_go([row])
         c_n, c_t = (float(s.outputs[part][row]) for part in (s.to.c_n, s.to.c_t))
         if row in self.slipping:
             self._drop_repeated()
-            return Switched(name, -math.copysign(1.0, c_t))
         return self.fail_by_slip(row, c_n, c_t)
 
     def _find_turning(self, events: Sequence[int]) -> list[int]:
