@@ -169,10 +169,10 @@ def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -
     """Replay of a plan, and residual of the equations of motion."""
     residual = find_residual(problem, trajectory)
     try:
-        seen = observe(problem, trajectory.torque, trajectory)
+        replay = observe(problem, trajectory.torque, trajectory)
     except (JammingError, SimulationError) as error:
         return ReplayCheck(error, residual)
-    return ReplayCheck(judge(seen, allowance), residual)
+    return ReplayCheck(judge(replay, trajectory, allowance), residual)
 
 
 def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
@@ -249,14 +249,14 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
         return _tabulate(problem, trajectory, rows, None)
     for _ in range(_ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
-        seen = observe(problem, read_rows(rows), trajectory)
-        report = judge(seen, Allowance())
+        simulation = observe(problem, read_rows(rows), trajectory)
+        report = judge(simulation, trajectory, Allowance())
         if report.ok or error <= least:
             break
         error = max(error / _FINER, least)
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not report.ok:
-        report = judge(seen._replace(plan=None), Allowance())
+        report = judge(simulation, None, Allowance())
     if not report.ok:
         raise ReplayError(
             f"the torques as a table of {len(rows)} rows do not hold in their replay: "
@@ -273,8 +273,8 @@ def sample_table(
     compared: dict[str, Any] | None = None
     if replay:
         try:
-            seen = observe(problem, read_rows(rows), trajectory)
-            compared = _compare(trajectory, judge(seen._replace(plan=None), Allowance()))
+            simulation = observe(problem, read_rows(rows), trajectory)
+            compared = _compare(trajectory, judge(simulation, None, Allowance()))
         except (JammingError, SimulationError) as error:
             compared = {"ok": False, "reason": str(error), "phases": []}
     sampling = {"sample_rate": rate, "interpolation": interpolation}

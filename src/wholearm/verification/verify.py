@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
@@ -48,16 +48,6 @@ ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
-
-
-class Observation(NamedTuple):
-    """A replay and its measurements, before tolerances are applied."""
-
-    plan: Trajectory | None  # what it is compared with
-    tolerance: float  # of the simulation
-    simulation: Simulation
-    phases: tuple[results.PhaseReport, ...]
-    gap: results.FingerGap | None
 
 
 @overload
@@ -123,29 +113,20 @@ def verify(
     problem, torque, plan = adopt_torques(problem, what)
     allowance = verdict.Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)
-    seen = observe(problem, torque, plan, tolerance, True)
-    report = judge(seen, allowance, reduced)
+    simulation = observe(problem, torque, plan, tolerance)
+    report = judge(simulation, plan, allowance, tolerance, uniqueness=True, reduced=reduced)
     if report.ok and not report.warnings:
         return report
-    return replace(report, help=find_help(seen.simulation, seen.phases, allowance))
+    return replace(report, help=find_help(simulation, report.phases, allowance))
 
 
 def observe(
-    problem: Problem,
-    torque: TorqueProfile,
-    plan: Trajectory | None,
-    tolerance: float = 1e-9,
-    uniqueness: bool = False,
-) -> Observation:
-    """Replay torques and record forces and gaps, more densely near their minima.
+    problem: Problem, torque: TorqueProfile, plan: Trajectory | None, tolerance: float = 1e-9
+) -> Simulation:
+    """Replay torques, and record forces where they are least and about `ROWS` times a phase.
 
-    Parameters
-    ----------
-    plan        what to compare the replay with
-    tolerance   of the simulation
-    uniqueness  whether to find uniqueness margins, and static indeterminacy of starts
-
-    JammingError, SimulationError if the simulation cannot go on.
+    With a `plan` that is where it has rows, to compare it with. JammingError, SimulationError if
+    the simulation cannot go on.
     """
     if plan is None:
         times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
@@ -153,13 +134,7 @@ def observe(
         owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
         picked = (rows[np.linspace(0, len(rows) - 1, ROWS + 1).astype(int)] for rows in owned)
         times = np.concatenate([plan.t[rows] for rows in picked])
-    simulation = simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
-    phases = tuple(
-        _report_phase(simulation, plan, index, uniqueness)
-        for index in range(int(simulation.phase[-1]) + 1)
-    )
-    gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
-    return Observation(plan, tolerance, simulation, phases, gap)
+    return simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
 
 
 def find_finger_gap(simulation: Simulation) -> results.FingerGap:
@@ -176,10 +151,24 @@ def find_finger_gap(simulation: Simulation) -> results.FingerGap:
     return results.FingerGap(*find_lowest(times[order], gaps[order], shortest))
 
 
-def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False) -> results.Report:
-    """Apply tolerances to a replay; see `verify`."""
-    simulation, phases, gap = seen.simulation, seen.phases, seen.gap
+def judge(
+    simulation: Simulation,
+    plan: Trajectory | None,
+    allowance: verdict.Allowance,
+    tolerance: float = 1e-9,
+    uniqueness: bool = False,
+    reduced: bool = False,
+) -> results.Report:
+    """Report on a replay of a plan, or of torques alone; see `verify`.
+
+    `uniqueness`: whether to find uniqueness margins, and static indeterminacy of starts.
+    """
     problem, torque = simulation.problem, simulation.torque
+    phases = tuple(
+        _report_phase(simulation, plan, index, uniqueness)
+        for index in range(int(simulation.phase[-1]) + 1)
+    )
+    gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
     reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += verdict.describe_failures(simulation, phases, gap if reached else None, allowance)
@@ -195,11 +184,11 @@ def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False
         warnings += describe_misses(phase, simulation)
     for time, text in describe_motors(problem, torque):
         number = sum(phase.start <= time for phase in phases)
-        if seen.plan is None:
+        if plan is None:
             warnings.append(text)
         else:
             failures.append(results.Failure(max(number, 1), text))
-    if seen.plan is not None:
+    if plan is not None:
         # The departure of later phases follows from that of the first.
         failures += thin + list(verdict.describe_departures(problem, phases, allowance))[:1]
     else:
@@ -216,7 +205,7 @@ def judge(seen: Observation, allowance: verdict.Allowance, reduced: bool = False
         phases=phases,
         energy=_balance(simulation),
         finger_gap=gap,
-        tolerance=seen.tolerance,
+        tolerance=tolerance,
         steps=simulation.steps,
         changes=tuple(
             results.ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
@@ -499,26 +488,23 @@ def reduce_to_first_joint(
     theta_1' in rad/s, tau (2,) [N m]; directions are the signs of friction.
     """
     scene = formation.scene
+
+    def extend(rows: Array, right: Array, first: float) -> Array:
+        """The x, (5,), with rows @ x = right and this component of the first joint."""
+        others = np.linalg.pinv(rows[:, _OTHERS]) @ (right - rows[:, 3] * first)
+        return np.insert(others, 3, first)
+
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    P_AI_inverse, P_AII = np.linalg.pinv(P[:, _OTHERS]), P[:, 3]
-
-    def extend(right: Array, first: float) -> Array:
-        full = np.empty(5)
-        full[_OTHERS] = P_AI_inverse @ (right - P_AII * first)
-        full[3] = first
-        return full
-
-    slope = extend(np.zeros(4), 1.0)
+    slope = extend(P, np.zeros(4), 1.0)
     kinematics = formation.evaluate(z[None], slope[None])
-    bend = extend(-kinematics.P_dot_v[0], 0.0)
-    G = force_rows(formation, kinematics, directions)[0]
-    dry = scene.dry * np.array([0.0, 0.0, 0.0, *directions.sigma])
-    resting = dry - scene.applied_force - np.array([0.0, 0.0, 0.0, *tau])
-    # Rows of each term of M5 z'' + b - g - S tau = G^T c; the others' rows solve for c.
-    eliminate = G[:, 3] @ np.linalg.inv(G[:, _OTHERS].T)
+    bend = extend(P, -kinematics.P_dot_v[0], 0.0)
+    # This sum of the rows of M5 z'' + b - g - S tau = G^T c has no contact forces.
+    weights = extend(force_rows(formation, kinematics, directions)[0], np.zeros(4), 1.0)
     mass = scene.mass_diagonal
+    resting = -scene.applied_force
+    resting[3:] += scene.dry[3:] * directions.sigma - tau
     terms = mass * slope, mass * bend * theta_1_dot + scene.viscous * slope, resting
-    Phi_1, Phi_2, Phi_3 = (float(term[3] - eliminate @ term[_OTHERS]) for term in terms)
+    Phi_1, Phi_2, Phi_3 = (float(term @ weights) for term in terms)
     return Phi_1, Phi_2, Phi_3
 
 
