@@ -230,7 +230,8 @@ def replay_in(
     setting = info.setting if setting is None else setting
     allowed = info.allowed if allowed is None else allowed
     plan = find_between(plan)
-    torque, stretches = apply_friction(problem.scene, plan), list_stretches(plan, whole)
+    torque = apply_friction(problem.scene, plan)
+    stretches = list_stretches(plan, [0] if whole else range(len(plan.motions)))
     levels = []
     # Finer settings, and finer steps alone, with contacts as they are at first.
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
@@ -434,7 +435,10 @@ def play_policy(
     info = ENGINES[engine]
     setting = info.setting if setting is None else setting
     arrivals = []
-    for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
+    # From rest; what comes to rest a little late in the replay still moves.
+    begins, rest = [0] if whole else [number - 1 for number in policy.resting], np.zeros(5)
+    for stretch in list_stretches(find_between(plan), begins):
+        stretch = stretch._replace(z_dot=rest, z_ddot=rest)
         if progress is not None:
             progress(f"phase {stretch.name} in {info.title}")
         last = stretch.phases[-1] + 1
@@ -444,17 +448,6 @@ def play_policy(
         arrivals.append(_judge(problem, plan, stretch, loop, run))
     title = f"{info.title} {version(engine)}"
     return PolicyReport(problem, title, allowed, tuple(arrivals))
-
-
-def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[EngineStretch]:
-    """Stretches that begin at rest, or one of all phases."""
-    begins = [1] if whole else policy.resting
-    stretches = []
-    for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
-        phases, stop, rest = tuple(range(first - 1, after - 1)), parts[after - 2].stop, np.zeros(5)
-        start = parts[first - 1]
-        stretches.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
-    return stretches
 
 
 def _judge(

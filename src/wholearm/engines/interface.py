@@ -21,6 +21,7 @@ both edges at one place. The links press each other without friction.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -198,11 +199,11 @@ Engine = Callable[[Problem, EngineStretch, Drive, Setting], EngineRun]
 """Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
 
 
-def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
-    """The whole plan, or its phases, each from its planned start."""
-    starts, count = plan.phase_starts, len(plan.motions)
-    stretches = []
-    for phases in [tuple(range(count))] if whole else [(index,) for index in range(count)]:
+def list_stretches(plan: Trajectory, begins: Sequence[int]) -> list[EngineStretch]:
+    """Parts of a plan, from its planned start at each of the phases `begins` to the next one."""
+    starts, stretches = plan.phase_starts, []
+    for first, after in pairwise([*begins, len(plan.motions)]):
+        phases = tuple(range(first, after))
         motion, start, stop = plan.motions[phases[0]], starts[phases[0]], starts[phases[-1] + 1]
         at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
         # Forces of a replay that waits at rest are NaN.
