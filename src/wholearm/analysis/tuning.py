@@ -26,9 +26,9 @@ from ..results.torque import TorqueProfile, format_rows, read_rows
 from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, FreeSimulation
 from ..simulation.simulate import simulate_free
-from ..simulation.system import REST_WINDOW, build_system
+from ..simulation.system import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
-from ..verification.verdict import DEPARTURE
+from ..verification.verdict import DEPARTURE, EndDistance
 from .slow_speeds import SQUEEZE, find_torques, sample_path
 
 FACTOR = 1.1
@@ -128,23 +128,15 @@ class Bench:
         self, problem: Problem, passage: Passage, z: Array, tell: Callable[[str], None]
     ) -> None:
         self.problem, self.passage, self.z, self.tell = problem, passage, z, tell
-        self.system = build_system(problem.scene)
-        until = passage.until.lead(z, problem.scene.scales.length)
-        names = self.system.names
-        self.pair = None if until.contact is None else names.index(until.contact.name)
-        self.column = 0 if until.coordinate == "x" else 2
-        self.value = math.nan if until.value is None else until.value
-        self.sign = float(np.sign(z[self.column] - self.value))
+        self.end = EndDistance(problem.scene, passage.until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.is_angle = self.pair is None and self.column == 2  # whether the end is one of phi
+        self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
         self.trials: list[TuningTrial] = []
         self.simulations = 0  # trials, and landings
 
     def measure(self, z: Array) -> Array:
         """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
-        if self.pair is None:
-            return self.sign * (z[:, self.column] - self.value)
-        return np.asarray(self.system.measure(z)[0][:, self.pair])
+        return self.end.evaluate(z, z)[0]
 
     def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
@@ -185,13 +177,13 @@ class Bench:
         if len(self.passage.phases) > 1:
             return False
         gap = float(self.measure(run.z[None])[0])
-        return gap > (1 + SETTINGS.back) * self.way or (self.pair is None and gap <= 0)
+        return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
 
     def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
         gaps = self.measure(simulation.z)
         ends, lost = self.passage.follow(simulation.events)
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
-        if self.pair is None and gaps.min() <= 0:
+        if not self.gains and gaps.min() <= 0:
             row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
             a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
             arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
@@ -256,15 +248,13 @@ class Bench:
 
     def _close(self, run: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
         """How fast the end closes, by how much that becomes less, and where."""
-        if self.pair is None and time > 0:
-            row = run.trajectory.at([time])
-            v, a = row.z_dot[0, self.column], row.z_ddot[0, self.column]
-            return -self.sign * float(v), self.sign * float(a), row.z[0]
-        z, v, a = run.z[at], run.z_dot[at], run.z_ddot[at]
-        if self.pair is None:
-            return (-self.sign * float(v[self.column]), self.sign * float(a[self.column]), z)
-        rows = self.system.evaluate(z, v, [self.pair])
-        return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
+        if self.gains or time == 0:
+            z, v, a = (part[[at]] for part in (run.z, run.z_dot, run.z_ddot))
+        else:
+            sample = run.trajectory.at([time])
+            z, v, a = sample.z, sample.z_dot, sample.z_ddot
+        _, (gradient,), (bend,) = self.end.evaluate(z, v)
+        return -float(gradient @ v[0]), float(gradient @ a[0] + bend), z[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verdict import DEPARTURE, measure_departure
+from .verdict import DEPARTURE, EndDistance, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -211,19 +211,16 @@ def _find_end(
     simulation: FreeSimulation, phase: Phase, after: Phase | None, start: float
 ) -> float | None:
     """When a phase ends, None if it does not [s]."""
-    start_row = int(np.searchsorted(simulation.t, start))
-    until = phase.until.lead(simulation.z[start_row], simulation.problem.scene.scales.length)
+    until, rows = phase.until, np.flatnonzero(simulation.t >= start)
     later = [event for event in simulation.events if event.time >= start]
     if until.contact is not None:
         times = [e.time for e in later if e.contact == until.contact.name]
         closed = [s for s in simulation.stretches if s.contact == until.contact.name]
         times += [max(s.start, start) for s in closed if s.stop > start]
     elif until.value is not None:
-        column, value = until.poses[0]
-        values = simulation.z[:, column] - value
-        rows = np.flatnonzero(simulation.t >= start)
-        passed = rows[values[rows] * values[rows[0]] <= 0]
-        times = simulation.t[passed[:1]].tolist()
+        z = simulation.z[rows]
+        distance, _, _ = EndDistance(simulation.problem.scene, until, z[0]).evaluate(z, z)
+        times = simulation.t[rows[distance <= 0][:1]].tolist()
     else:
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
         times = [e.time for e in lost if e.contact in list_leaving(phase, after)]

@@ -19,13 +19,12 @@ from ..mechanics.dynamics import Directions, force_rows
 from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
 from ..mechanics.statics import Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
-from ..problem.definition import End, Phase, Problem, Until
+from ..problem.definition import End, Phase, Problem
 from ..results import report as results
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
-from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import (
     Response,
@@ -555,8 +554,9 @@ def _examine_loss(
         row = int(rows[simulation.t[rows] <= time][-1])
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
-    until = phase.until.lead(simulation.z[rows[0]], problem.scene.scales.length)
-    distance = _measure_distance(until, problem.scene, z[None], v[None])
+    end, distance = verdict.EndDistance(problem.scene, phase.until, simulation.z[rows[0]]), None
+    if not phase.until.is_release:
+        distance = end.evaluate(z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
@@ -628,47 +628,25 @@ def find_approach(simulation: Simulation) -> results.Approach | None:
     problem = simulation.problem
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
     rows = np.flatnonzero(simulation.phase == phase.index)
-    t, v = simulation.t[rows], simulation.z_dot[rows]
-    until = phase.until.lead(simulation.z[rows[0]], scales.length)
-    distance = _measure_distance(until, problem.scene, simulation.z[rows], v)
-    if distance is None:
+    if phase.until.is_release:
         return None
-    is_angle = until.coordinate == "phi"
-    gaps, gradient, _ = distance
+    t, z, v = simulation.t[rows], simulation.z[rows], simulation.z_dot[rows]
+    end = verdict.EndDistance(problem.scene, phase.until, z[0])
+    gaps, gradient, _ = end.evaluate(z, v)
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps)
-    unit = scales.rate if is_angle else scales.speed
+    unit = scales.rate if end.unit == "rad" else scales.speed
     going = np.flatnonzero(np.abs(rates) > 1e-6 * unit)
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
     return results.Approach(
         phase=phase.number,
         until=str(phase.until),
         distance=max(least, 0.0),
-        unit="rad" if is_angle else "m",
+        unit=end.unit,
         time=time,
         rate=float(np.interp(time, t, rates)) + 0.0,
         turns=tuple(float(t[row]) for row in turns),
     )
-
-
-def _measure_distance(
-    until: Until, scene: Scene, z: Array, v: Array
-) -> tuple[Array, Array, Array] | None:
-    """Distance to the end of a phase at n states, its gradient, (n, 5), and its bend, (n,).
-
-    The bend is what the velocity alone adds to its second derivative, towards the end.
-    """
-    if until.is_release:
-        return None
-    if until.contact is not None:
-        at = Formation(scene, (until.contact,)).evaluate(z, v)
-        return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
-    column, value = until.poses[0]
-    offset = z[:, column] - value
-    side = math.copysign(1.0, offset[0])
-    gradient = np.zeros((len(z), 5))
-    gradient[:, column] = side
-    return side * offset, gradient, np.zeros(len(z))
 
 
 def find_resting_changes(
