@@ -417,11 +417,11 @@ class FreeRun(Run):
             if moved and self.stands:
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
-                self.note_at(EventKind.GIVEN_UP, "decisions do not end")
+                self.note(EventKind.GIVEN_UP, "decisions do not end")
                 return
             if rests is None:
                 if not self._jolt():
-                    self.note_at(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
+                    self.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
                     if not self.records:
                         self.record(still=True)
                     return
@@ -436,7 +436,7 @@ class FreeRun(Run):
             except StuckError:
                 # Forces grow without bound where the motion jams.
                 if not self._jolt():
-                    self.note_at(EventKind.GIVEN_UP, "steps become too short")
+                    self.note(EventKind.GIVEN_UP, "steps become too short")
                     return
 
     # Instants: impacts and modes.
@@ -456,12 +456,6 @@ class FreeRun(Run):
         least = max(CHATTER, 1e3 * self.tolerance)
         raised = min(recent // 20, 2) + recent // 200
         return least * self.system.scales.speed * 10.0**raised
-
-    def note_at(
-        self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
-    ) -> None:
-        """Append an event at present, whose text says when."""
-        self.note(kind, f"{text} at t = {self.t:.6g} s", contact, value)
 
     def _is_still(self, acceleration: Array) -> bool:
         return self.system.is_slower(acceleration * self.system.scales.time, STILL)
@@ -540,7 +534,7 @@ class FreeRun(Run):
             # What chatters may do so again at once: in `draw_run(139)` of the tests six times.
             told = (e for e in self.events if e.kind is kind and e.contact == name)
             if bouncing or all(self.t - e.time >= pause for e in told):
-                self.note_at(kind, note, name, float(-rates[k]))
+                self.note(kind, note, name, float(-rates[k]))
         self.set_velocity(v)
 
     def _pose(self, closed: ClosedContacts, v: Array) -> ContactProblem:
@@ -588,11 +582,8 @@ class FreeRun(Run):
         if not exact or system.is_slower(exact[0].change, STANDING):
             return False
         names = " ".join(system.names[pair] for pair in pattern.closed)
-        self.note_at(
-            EventKind.INCONSISTENT,
-            f"no finite forces keep {names} closed: an impact without a collision",
-            names,
-        )
+        text = f"no finite forces keep {names} closed: an impact without a collision"
+        self.note(EventKind.INCONSISTENT, text, names)
         self.set_velocity(self.v + exact[0].change)
         return True
 
@@ -689,12 +680,12 @@ class FreeRun(Run):
             heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
             if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
                 text = f"{names[pair]} goes on as {names[heirs[0]]}"
-                self.note_at(EventKind.PASS, text, names[heirs[0]])
+                self.note(EventKind.PASS, text, names[heirs[0]])
                 new.remove(heirs[0])
             elif pair not in closed or self.records:
-                self.note_at(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
+                self.note(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
         for pair in new if self.records else ():
-            self.note_at(EventKind.GAINED, f"{names[pair]} presses", names[pair])
+            self.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
         if not self.records:
             before = modes
         slid = dict(zip(before.kept, before.Xi, strict=True))
@@ -707,11 +698,11 @@ class FreeRun(Run):
         changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
         for name, old, now, verb in changes:
             if old != now:
-                self.note_at(*describe_change(name, old, now, verb), name)
+                self.note(*describe_change(name, old, now, verb), name)
         if rests:
-            self.note_at(EventKind.REST, "everything rests")
+            self.note(EventKind.REST, "everything rests")
         elif self.resting:
-            self.note_at(EventKind.START, "the motion begins")
+            self.note(EventKind.START, "the motion begins")
 
     def _note_ambiguity(self, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
         """Record that there are several answers, once for each set of contacts."""
@@ -732,7 +723,7 @@ class FreeRun(Run):
         text += f" ({'; or '.join(texts)})"
         last = [event for event in self.events if event.kind is EventKind.AMBIGUOUS]
         if not last or last[-1].text.split(" at t =")[0] != text:
-            self.note_at(EventKind.AMBIGUOUS, text, " ".join(names))
+            self.note(EventKind.AMBIGUOUS, text, " ".join(names))
 
     # Rest.
 

@@ -288,21 +288,19 @@ class Replay(Run):
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
         how = "to zero" if c_n > -1e3 * self.rounding else f"to {c_n:.3g} N"
-        text = f"c_n of {contact} falls {how} {self.when()}"
-        self.note(EventKind.CONTACT_LOST, text, contact, c_n)
+        text = self.note(EventKind.CONTACT_LOST, f"c_n of {contact} falls {how}", contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
     def release(self, c_n: float) -> Stop:
         """End the phase as the next one lets contacts go; the least that they would need [N]."""
         names = ", ".join(self.releasable)
-        self.note(EventKind.RELEASE, f"{names} released {self.when()}", names, c_n)
+        self.note(EventKind.RELEASE, f"{names} released", names, c_n)
         self.moving = True
         return Stop.PHASE
 
     def switch(self, contact: str, sign: float = 0.0) -> Stop:
         """End the phase as a contact slips with a `sign`, or comes to rest, as in the next one."""
-        text = f"{contact} {'slips' if sign else 'comes to rest'} {self.when()}"
-        self.note(EventKind.ARRIVAL, text, contact)
+        self.note(EventKind.ARRIVAL, f"{contact} {'slips' if sign else 'comes to rest'}", contact)
         self.slip_signs = {contact: sign} if sign else {}
         self.moving = True
         return Stop.PHASE
@@ -313,8 +311,8 @@ class Replay(Run):
         if row in self.slipping:
             return self.switch(name, -math.copysign(1.0, c_t))
         how = "exceeds" if abs(c_t) - bound > 1e3 * self.rounding else "reaches"
-        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
-        self.note(EventKind.SLIP, text, name, bound - abs(c_t))
+        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N"
+        text = self.note(EventKind.SLIP, text, name, bound - abs(c_t))
         return Outcome(OutcomeKind.SLIPS, text)
 
     def run_out(self) -> Outcome:
@@ -326,12 +324,12 @@ class Replay(Run):
             texts = [f"{', '.join(names[k] for k in sorted(rows))} {t}" for rows, t in ends if rows]
             if self.releasable:
                 texts = [f"{', '.join(self.releasable)} is released"]
-            text = f"the torques end {self.when()}, before {' or '.join(texts)}"
+            more = f", before {' or '.join(texts)}"
         else:
             distance = self.distance
             unit = "rad" if until.coordinate == "phi" else "m"
-            text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
-        self.note(EventKind.END, text, "", distance)
+            more = f", {distance:.3g} {unit} short of {until}"
+        text = self.note(EventKind.END, "the torques end", "", distance, more)
         return Outcome(OutcomeKind.GOAL_MISSED, text)
 
     @property
@@ -377,7 +375,7 @@ class Replay(Run):
         If the next break of the torques is within the `window` [s], the arrival belongs to it.
         """
         until, following = self.phase.until, self.following
-        self.note(EventKind.ARRIVAL, f"{until} reached {self.when()}", str(until), -self.rate)
+        self.note(EventKind.ARRIVAL, f"{until} reached", str(until), -self.rate)
         if self._strikes() and following is not None:
             self.moving = True
             return self.collide(following) or Stop.PHASE
@@ -415,7 +413,7 @@ class Replay(Run):
                 if isinstance(change, StartDeparture) and change.x <= x:
                     return self.set_off(change)
                 if not sticks:
-                    self.note(EventKind.STICK, f"the object sticks {self.when()}")
+                    self.note(EventKind.STICK, "the object sticks")
                 sticks = True
                 if isinstance(change, StartDeparture):
                     self.wait(self.time(change.x))
@@ -562,7 +560,7 @@ class Replay(Run):
         self.next_piece()
         if not self.steps_at[self.piece]:
             return None
-        self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
+        self.note(EventKind.TORQUE_STEP, "the torques step")
         return self.restart()
 
     def handle(self, kinds: Sequence[int]) -> Ending | None:
@@ -581,8 +579,7 @@ class Replay(Run):
             return self.slip()
         reached = [] if bounds else [k for k in kinds if limit.start <= k < limit.stop]
         if reached:
-            text = f"{self.leg.limits[reached[0] - limit.start]} {self.when()}"
-            self.note(EventKind.LIMIT, text)
+            text = self.note(EventKind.LIMIT, self.leg.limits[reached[0] - limit.start])
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
@@ -673,7 +670,7 @@ class Replay(Run):
         names = following.formation.names
         normal = impact.p[: len(names)]
         impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
-        self.note(EventKind.IMPACT, f"impact {self.when()}, in N s {impulses}", name, least)
+        self.note(EventKind.IMPACT, "impact", name, least, f", in N s {impulses}")
         if impact.violations:
             worst = impact.violations[0]
             text = f"{worst.describe()} in the impact {self.when()}"
@@ -687,7 +684,7 @@ class Replay(Run):
         """Move from rest, with the friction signs of the start."""
         if not self.gets_on():
             raise SimulationError(f"starting and stopping do not end {self.when()}")
-        self.note(EventKind.START, f"the object starts to move {self.when()}")
+        self.note(EventKind.START, "the object starts to move")
         formation, signs = self.formation, departure.signs
         mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
@@ -796,7 +793,7 @@ class Replay(Run):
     def come_to_rest(self) -> Stop:
         """End all motion, and the phase if a contact was to come to rest."""
         if not self.is_there():
-            self.note(EventKind.REST, f"the object comes to rest {self.when()}")
+            self.note(EventKind.REST, "the object comes to rest")
         return self._hold() if self.resting else Stop.REST
 
     def _hold(self) -> Stop:
@@ -874,7 +871,7 @@ class Replay(Run):
                 self.next_piece()
                 if self.steps_at[self.piece]:
                     break
-            self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
+            self.note(EventKind.TORQUE_STEP, "the torques step")
         elif self._goes_on(longest):
             return False
         else:
@@ -907,7 +904,7 @@ class Replay(Run):
         contact = row < len(names)
         name = names[row] if contact else f"joint {row - len(names) + 1}"
         kind, text = describe_change(name, before, after, "slides" if contact else "turns")
-        self.note(kind, f"{text} {self.when()}", name)
+        self.note(kind, text, name)
 
     def _choose(self, signs: Array, still: Sequence[Unit]) -> tuple[Array, Mode]:
         """The most consistent signs of what stands still; `JammingError` without any."""

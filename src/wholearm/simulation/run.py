@@ -326,9 +326,17 @@ class Run(ABC):
         self.t = stop
         self.record(still=True)
 
-    def note(self, kind: EventKind, text: str, contact: str = "", value: float = math.nan) -> None:
-        """Append an event at present."""
+    def when(self) -> str:
+        """Present time, in a sentence."""
+        return f"at t = {self.t:.6g} s"
+
+    def note(
+        self, kind: EventKind, text: str, contact: str = "", value: float = math.nan, more: str = ""
+    ) -> str:
+        """Append an event at present; its text, which says when, and then `more`."""
+        text = f"{text} {self.when()}{more}"
         self.events.append(Event(self.t, self.phase_index, kind, text, contact, value))
+        return text
 
     def record(self, still: bool = False) -> None:
         """Record the present instant from the outputs of the steps.
