@@ -29,7 +29,7 @@ from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
 from ..verification.verdict import DEPARTURE, EndDistance
-from .slow_speeds import SQUEEZE, find_torques, sample_path
+from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
 FACTOR = 1.1
 """What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
@@ -119,142 +119,6 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
     """A table of t and both torques, shape (n, 3), that steps from one constant to the next."""
     t = np.repeat([*(step.time for step in steps), end], 2)[1:-1]
     return np.column_stack([t, np.repeat([step.tau for step in steps], 2, axis=0)])
-
-
-class Bench:
-    """Trials of one passage from rest at `z`, shape (5,); `tell` is shown each, in words."""
-
-    def __init__(
-        self, problem: Problem, passage: Passage, z: Array, tell: Callable[[str], None]
-    ) -> None:
-        self.problem, self.passage, self.z, self.tell = problem, passage, z, tell
-        self.end = EndDistance(problem.scene, passage.until, z)
-        self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
-        self.trials: list[TuningTrial] = []
-        self.simulations = 0  # trials, and landings
-
-    def measure(self, z: Array) -> Array:
-        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
-        return self.end.evaluate(z, z)[0]
-
-    def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
-        """Simulate torques until the end of the passage, or what keeps it from coming."""
-        end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
-        torque = read_rows(make_rows(steps, end))
-        simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
-        self.simulations += 1
-        self.trials.append(self._judge(tuple(steps), simulation))
-        self.tell(f"{title}: {self.trials[-1].to_text()}")
-        return self.trials[-1]
-
-    def land(self, steps: Sequence[TuningStep], arrival: float, end: float) -> tuple[Array, str]:
-        """Simulate torques that hold the object from its arrival [s] to an end [s].
-
-        Returns where it is then, (5,), and what does not hold; empty if everything rests and no
-        contact of the next phase, or else of the last one, has parted.
-        """
-        self.simulations += 1
-        simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
-        names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
-        parted = {
-            name: max((b - a for a, b in simulation.list_pauses(name, arrival, end)), default=0.0)
-            for name in names
-        }
-        worst = max(parted, key=parted.__getitem__)
-        if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
-            reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
-        elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
-            reason = "the object does not come to rest there"
-        return simulation.z[-1], reason
-
-    def _is_over(self, run: FreeRun) -> bool:
-        if run.t == 0:
-            return False
-        ends, loss = self.passage.follow(run.events)
-        if run.resting or loss is not None or len(ends) == len(self.passage.phases):
-            return True
-        if len(self.passage.phases) > 1:
-            return False
-        gap = float(self.measure(run.z[None])[0])
-        return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
-
-    def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
-        gaps = self.measure(simulation.z)
-        ends, lost = self.passage.follow(simulation.events)
-        arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
-        if not self.gains and gaps.min() <= 0:
-            row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
-            a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
-            arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
-        before = len(self.passage.phases) - 1
-        start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
-        # When the end, once nearer, is farther away again.
-        rows = np.flatnonzero(simulation.t >= start)
-        risen = gaps[rows] - np.minimum.accumulate(gaps[rows])
-        back = rows[risen > SETTINGS.back * abs(self.way)]
-        turn = float(simulation.t[back].min(initial=math.inf))
-        stop = min(arrival, turn, float(simulation.t[-1]))
-        # When contacts of its phases part, also those that never press.
-        losses = [] if lost is None else [(lost.time, lost.contact)]
-        starts = [0.0, *ends][: len(self.passage.phases)]
-        spans = zip(self.passage.phases, starts, [*starts[1:], stop], strict=False)
-        for phase, first, last in spans:
-            phase_losses = find_losses(simulation, phase, first, last, DEPARTURE)
-            losses += [(loss.time, loss.contact) for loss in phase_losses]
-        losses = [loss for loss in losses if loss[0] < stop]
-        time, contact = min(losses, default=(stop, ""))
-        at = int(np.searchsorted(simulation.t, time))
-        # The step in which a coordinate arrives goes on beyond that.
-        t, c_n = simulation.t[: at + 1].copy(), simulation.c_n[: at + 1].copy()
-        gaps = gaps[: at + 1].copy()
-        if t[at] > time > 0:
-            sample, t[at] = simulation.trajectory.at([time]), time
-            gaps[at] = self.measure(sample.z)[0]
-            pairs = [simulation.trajectory.contacts.index(name) for name in simulation.contacts]
-            c_n[at] = sample.c_n[0, pairs]
-        least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
-        short = float(gaps[t >= start].min(initial=math.inf))
-        if losses:
-            outcome = TrialOutcome.LOSES
-        elif least < self.problem.epsilon:
-            outcome, contact, time = TrialOutcome.LOSES, weakest, float(t[row])
-        elif arrival == stop:
-            outcome = TrialOutcome.ARRIVES
-        else:
-            rests = turn == stop or not simulation.z_dot[at].any()
-            outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
-        rate, slowing, z = self._close(simulation, time, at)
-        return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
-
-    def _find_least(
-        self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]
-    ) -> tuple[float, str, int]:
-        """The least of normal forces over time, of which contact, and in which row."""
-        phases = self.passage.phases
-        of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
-        best = (math.inf, phases[0].formation.names[0], 0)
-        for index, after in enumerate((*phases[1:], self.passage.after)):
-            phase, rows = phases[index], np.flatnonzero(of == index)
-            # Contacts that the phase releases at its end do not count.
-            leaving = list_leaving(phase, after) if phase.until.is_release else set()
-            names = [name for name in phase.formation.names if name not in leaving]
-            columns = [contacts.index(name) for name in names]
-            c_n = np.nan_to_num(forces[rows][:, columns], nan=math.inf)
-            if c_n.min(initial=math.inf) < best[0]:
-                row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
-                best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
-        return best
-
-    def _close(self, run: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
-        """How fast the end closes, by how much that becomes less, and where."""
-        if self.gains or time == 0:
-            z, v, a = (part[[at]] for part in (run.z, run.z_dot, run.z_ddot))
-        else:
-            sample = run.trajectory.at([time])
-            z, v, a = sample.z, sample.z_dot, sample.z_ddot
-        _, (gradient,), (bend,) = self.end.evaluate(z, v)
-        return -float(gradient @ v[0]), float(gradient @ a[0] + bend), z[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,57 +304,89 @@ def tune(
         raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {SETTINGS.stops}")
     if stops and not brake:
         raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
-    tell = progress or (lambda text: None)
+    options = TuningOptions(brake, squeeze, share, progress or (lambda text: None))
     tuned: list[PhaseTuning] = []
     steps: list[TuningStep] = []
     z, clock = problem.start, 0.0
     with name_source(problem.source):
         for passage in split_passages(problem):
-            setting = _Setting(problem, passage, brake, squeeze, share, tell)
-            tuned += (parts := _carry(setting, z, stops))
+            tuned += (parts := _carry(problem, passage, options, z, stops))
             for part in parts:
                 if part.end is None:
                     reason = f"phase{'s' if '-' in part.title else ''} {part.title}: {part.reason}"
                     return Tuning(problem.name, tuple(tuned), None, None, reason)
                 steps += [step._replace(time=clock + step.time) for step in part.steps]
-                clock += part.duration + setting.pause
+                clock += part.duration + SETTINGS.pause * problem.scene.scales.time
                 z = part.end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
     return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
-def _carry(setting: _Setting, z: Array, stops: int) -> list[PhaseTuning]:
+def _carry(
+    problem: Problem, passage: Passage, options: TuningOptions, z: Array, stops: int
+) -> list[PhaseTuning]:
     """Tune a passage from rest at `z`, with stops on the way where that does not succeed."""
-    tuning = setting.tune(z)
-    halves = setting.halve(z) if tuning.end is None and stops else None
+    tuner = PassageTuner(problem, passage, z, options)
+    tuning = tuner.tune()
+    halves = tuner.halve() if tuning.end is None and stops else None
     if halves is None:
         return [tuning]
-    first = _carry(halves[0], z, (stops - 1) // 2)
+    first = _carry(problem, halves[0], options, z, (stops - 1) // 2)
     first[0] = replace(first[0], simulations=first[0].simulations + tuning.simulations)
     if first[-1].end is None:
         return first
-    return [*first, *_carry(halves[1], first[-1].end, stops - len(first))]
+    return [*first, *_carry(problem, halves[1], options, first[-1].end, stops - len(first))]
 
 
-class _Setting(NamedTuple):
-    """A passage, and how it is tuned."""
+class TuningOptions(NamedTuple):
+    """As of `tune`."""
 
-    problem: Problem
-    passage: Passage
     brake: bool
     squeeze: float
     share: float
     tell: Callable[[str], None]
 
-    @property
-    def pause(self) -> float:
-        """How long the object is held at the end [s]."""
-        return SETTINGS.pause * self.problem.scene.scales.time
 
-    def halve(self, z: Array) -> tuple[_Setting, _Setting] | None:
-        """Both halves of the way from `z`, the first until x or phi is what it is there."""
-        phases, paths = self.passage.phases, []
+class TuningDrive(NamedTuple):
+    """Torques that reach the end of the phase, with a brake or without."""
+
+    # how many times the acting torque (that of the brake) is raised; lowered if negative
+    raised: int
+    trial: TuningTrial
+    supported: int = 0  # how many times the supporting torque is raised in the brake
+
+
+class PassageTuner:
+    """The rule at work on one passage from rest at `z`, shape (5,), and its trials.
+
+    Quasistatic torques `tau`, (2,) [N m], are raised and lowered; `last` are those at the end of
+    the passage; `acting` is the index of the acting finger.
+    """
+
+    tau: Array
+    last: Array
+    acting: int
+    title: str  # what its trials are told with
+
+    def __init__(
+        self, problem: Problem, passage: Passage, z: Array, options: TuningOptions
+    ) -> None:
+        self.problem, self.passage, self.z, self.options = problem, passage, z, options
+        self.end = EndDistance(problem.scene, passage.until, z)
+        self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
+        self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
+        self.limit, scales = problem.scene.torque_limit, problem.scene.scales
+        self.slow = SETTINGS.slow * scales.speed / (scales.length if self.is_angle else 1.0)
+        self.time = scales.time
+        # Two freedoms where the object arrives.
+        self.is_free = passage.phases[-1].formation.n_constraints < 4
+        self.trials: list[TuningTrial] = []
+        self.simulations = 0  # trials, and landings
+
+    def halve(self) -> tuple[Passage, Passage] | None:
+        """Both halves of the way, the first until x or phi is what it is there."""
+        phases, paths, z = self.passage.phases, list[PathSamples](), self.z
         for phase in phases:
             path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
             if path is None:
@@ -507,83 +403,80 @@ class _Setting(NamedTuple):
         until = Until(coordinate=name, value=float(value))
         part = replace(phases[k], until=until, end=End.REST)
         first = Passage((*phases[:k], part), phases[k])
-        second = Passage(phases[k:], self.passage.after)
-        return self._replace(passage=first), self._replace(passage=second)
+        return first, Passage(phases[k:], self.passage.after)
 
-    def tune(self, z: Array) -> PhaseTuning:
-        """Tune it from rest at `z`."""
+    def tune(self) -> PhaseTuning:
+        """Tune it."""
         phases = self.passage.phases
         tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
             text = "a coordinate is passed in motion; the rule tunes phases to rest"
             return replace(tuning, reason=text)
-        balance = self._balance(phases, z)
+        balance = self._balance(phases, self.z)
         if balance is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
             return replace(tuning, reason=text)
-        best, (balanced, acting) = None, balance
-        title = f"phase {tuning.title} of {len(self.problem.phases)}, finger {acting + 1}"
-        bench = Bench(self.problem, self.passage, z, lambda text: self.tell(f"{title}: {text}"))
+        best, (balanced, self.acting) = None, balance
+        self.last, count = balanced[-1], len(self.problem.phases)
+        self.title = f"phase {tuning.title} of {count}, finger {self.acting + 1}"
         # Supporting torques until one serves.
-        for tau in list_starts(balanced, acting):
-            rule = TuningRule(bench, tau, balanced[-1], acting)
-            attempt = self._tune_from(rule, replace(tuning, acting=acting + 1))
+        for tau in list_starts(balanced, self.acting):
+            self.tau = tau
+            attempt = self._try(replace(tuning, acting=self.acting + 1))
             if attempt.end is not None:
                 return attempt
             if best is None or best.raised is None:
                 best = attempt
-            if rule.is_exhausted:
+            if self.is_exhausted:
                 break
         assert best is not None
         return best
 
-    def _tune_from(self, rule: TuningRule, own: PhaseTuning) -> PhaseTuning:
-        """Tune it from certain torques."""
-        own, bench = replace(own, quasistatic=rule.scale(0)), rule.bench
-        drives = rule.drive()
-        drives = drives[: 1 + round(self.share * (len(drives) - 1))]
+    def _try(self, own: PhaseTuning) -> PhaseTuning:
+        """Tune it from the present torques."""
+        own, drives = replace(own, quasistatic=self.scale(0)), self.drive()
+        drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
-            return _sum_up(own, bench, bench.trials[-1], reason=_explain(bench))
-        if not self.brake:
+            return self._sum_up(own, self.trials[-1], reason=self._explain())
+        if not self.options.brake:
             # The fastest that is held where it arrives; the slowest arrives most gently.
             held = None
             for drive in drives:
-                attempt = self._hold(replace(own, raised=drive.raised), rule, drive.trial)
+                attempt = self._hold(replace(own, raised=drive.raised), drive.trial)
                 if attempt.end is None:
                     return held or attempt
                 held = attempt
             assert held is not None
             return held
-        stopped = rule.brake(drives)
+        stopped = self.brake(drives)
         if stopped is None:
             text = "no torque in steps of 10 % brings it to rest at its end: a trial "
-            text += bench.trials[-1].to_text()
-            return _sum_up(own, bench, drives[-1].trial, raised=drives[-1].raised, reason=text)
+            text += self.trials[-1].to_text()
+            return self._sum_up(own, drives[-1].trial, raised=drives[-1].raised, reason=text)
         drive, brake = stopped
         own = replace(own, raised=drive.raised, braked=brake.raised, supported=brake.supported)
-        return self._hold(own, rule, brake.trial)
+        return self._hold(own, brake.trial)
 
-    def _hold(self, own: PhaseTuning, rule: TuningRule, trial: TuningTrial) -> PhaseTuning:
+    def _hold(self, own: PhaseTuning, trial: TuningTrial) -> PhaseTuning:
         """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
-        unit = "rad/s" if rule.bench.is_angle else "m/s"
-        rate = f"{trial.rate:.3g} {unit} at t = {trial.time:.5g} s"
-        for tau in self._list_holds(rule, trial):
+        rate = f"{trial.rate:.3g} {self.end.unit}/s at t = {trial.time:.5g} s"
+        for tau in self._list_holds(trial):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
-            z, text = rule.bench.land(steps, trial.time, trial.time + self.pause)
-            own = _sum_up(own, rule.bench, trial, steps=steps, end=None if text else z)
+            z, text = self.land(steps, trial.time, trial.time + SETTINGS.pause * self.time)
+            own = self._sum_up(own, trial, steps=steps, end=None if text else z)
             if not text:
                 break
             own = replace(own, reason=f"{self.passage.until} is reached at {rate}, and {text}")
         return own
 
-    def _list_holds(self, rule: TuningRule, trial: TuningTrial) -> list[tuple[float, float] | None]:
+    def _list_holds(self, trial: TuningTrial) -> list[tuple[float, float] | None]:
         """What may hold the object: what it arrives with, or quasistatic torques lowered.
 
         Those are of the next phase, or of the end of the last one; then those it arrives with, the
         acting one lowered, and the supporting one more so.
         """
         after = self.passage.after
-        acting, (first, second) = rule.acting, (float(tau) for tau in rule.last)
+        acting, (first, second) = self.acting, (float(tau) for tau in self.last)
         if after is not None:
             balance = self._balance((after,), trial.z)
             if balance is None:
@@ -610,7 +503,7 @@ class _Setting(NamedTuple):
             path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
             torques = None
             if path is not None:
-                torques = find_torques(path, self.problem.epsilon, self.squeeze)
+                torques = find_torques(path, self.problem.epsilon, self.options.squeeze)
             if path is None or torques is None:
                 break
             tau.append(torques.tau)
@@ -620,53 +513,25 @@ class _Setting(NamedTuple):
             return None
         return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())
 
+    def _sum_up(self, own: PhaseTuning, trial: TuningTrial, **more: Any) -> PhaseTuning:
+        """The tuning with the numbers of a trial, and what it took."""
+        more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
+        more |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
+        return replace(own, simulations=self.simulations, **more)
 
-def _sum_up(own: PhaseTuning, bench: Bench, trial: TuningTrial, **more: Any) -> PhaseTuning:
-    """The tuning of a phase with the numbers of a trial, and what it took."""
-    more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
-    more |= {"weakest": trial.weakest, "trials": tuple(bench.trials)}
-    return replace(own, simulations=bench.simulations, **more)
-
-
-def _explain(bench: Bench) -> str:
-    """Why no torque drives the object to the end of a phase."""
-    nearest = min(bench.trials, key=lambda trial: trial.short)
-    last = bench.trials[-1]
-    text = f"no constant torques reach {bench.passage.until}: the nearest trial {nearest.to_text()}"
-    if last.outcome is TrialOutcome.LOSES:
-        return f"{text}, and raised {len(bench.trials) - 1} times it {last.to_text()}"
-    return f"{text}, up to the torque limit"
-
-
-class TuningDrive(NamedTuple):
-    """Torques that reach the end of the phase, with a brake or without."""
-
-    # how many times the acting torque (that of the brake) is raised; lowered if negative
-    raised: int
-    trial: TuningTrial
-    supported: int = 0  # how many times the supporting torque is raised in the brake
-
-
-class TuningRule:
-    """The rule at work on one phase.
-
-    Quasistatic torques `tau`, (2,) [N m], are raised and lowered; `last` are those at the end of
-    the phase; `acting` is the index of the acting finger.
-    """
-
-    def __init__(self, bench: Bench, tau: Array, last: Array, acting: int) -> None:
-        self.bench, self.tau, self.last, self.acting = bench, tau, last, acting
-        self.limit = bench.problem.scene.torque_limit
-        scales = bench.problem.scene.scales
-        self.slow = SETTINGS.slow * scales.speed / (scales.length if bench.is_angle else 1.0)
-        self.time = scales.time
-        # Two freedoms where the object arrives.
-        self.is_free = bench.passage.phases[-1].formation.n_constraints < 4
+    def _explain(self) -> str:
+        """Why no torque drives the object to the end."""
+        nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
+        text = f"no constant torques reach {self.passage.until}: the nearest trial "
+        text += nearest.to_text()
+        if last.outcome is TrialOutcome.LOSES:
+            return f"{text}, and raised {len(self.trials) - 1} times it {last.to_text()}"
+        return f"{text}, up to the torque limit"
 
     @property
     def is_exhausted(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
-        return self.bench.simulations > SETTINGS.simulations
+        return self.simulations > SETTINGS.simulations
 
     def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
         """The torques raised so many times, lowered where negative."""
@@ -685,7 +550,7 @@ class TuningRule:
             tau = self.scale(raised)
             if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
-            trial = self.bench.run([TuningStep(0.0, tau)], f"raised {raised} times")
+            trial = self.run([TuningStep(0.0, tau)], f"raised {raised} times")
             if trial.outcome is TrialOutcome.ARRIVES:
                 drives.append(TuningDrive(raised, trial))
             elif trial.outcome is TrialOutcome.LOSES:
@@ -731,7 +596,7 @@ class TuningRule:
             steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
             trial = self._place(steps, drive, best and best.trial, SETTINGS.coarse * self.slow)
             if trial is None:
-                if best is None and self.bench.trials[-1].outcome is TrialOutcome.LOSES:
+                if best is None and self.trials[-1].outcome is TrialOutcome.LOSES:
                     break
                 missed += best is not None
                 raised -= SETTINGS.brake_step
@@ -755,9 +620,9 @@ class TuningRule:
         Where a weaker brake, or nearly the same instant, is known the search begins near it.
         """
         low, high = 0.0, drive.time
-        below, above = self.bench.way, self._overshoot(drive, slow)
+        below, above = self.way, self._overshoot(drive, slow)
         at, side, losses = 0.5 * high, 0, 0
-        short, rate = self.bench.way, drive.rate
+        short, rate = self.way, drive.rate
         if near is not None and slow == self.slow:
             high, above = near.steps[-1].time, self._overshoot(near, slow)
             at = high * (1 - 1e-4)
@@ -765,7 +630,7 @@ class TuningRule:
             at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
         for count in range(SETTINGS.trials):
             steps = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self.bench.run(steps, f"brake at {at:.5g} s")
+            trial = self.run(steps, f"brake at {at:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
@@ -780,10 +645,10 @@ class TuningRule:
                     return None
                 low, short = at, trial.short
                 # How far it is through several phases is not known.
-                below = above if short == math.inf else max(short, 1e-12 * self.bench.way)
+                below = above if short == math.inf else max(short, 1e-12 * self.way)
                 above /= 2 if side > 0 else 1
                 side = 1
-            jumps = short > SETTINGS.far * self.bench.way and rate > SETTINGS.fast * drive.rate
+            jumps = short > SETTINGS.far * self.way and rate > SETTINGS.fast * drive.rate
             if jumps and high - low < SETTINGS.bracket * high:
                 return None
             share = below / (below + above) if count % 4 != 3 else 0.5
@@ -801,7 +666,7 @@ class TuningRule:
 
         def run(at: float) -> tuple[float, TuningTrial]:
             again = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self.bench.run(again, f"brake at {at:.5g} s")
+            trial = self.run(again, f"brake at {at:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
         grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
@@ -830,6 +695,128 @@ class TuningRule:
         """How far beyond the end the object would come to rest, less the wanted speed's part."""
         slowing = max(trial.slowing, 0.1 * trial.rate / self.time)
         return (trial.rate**2 - (0.5 * slow) ** 2) / (2 * slowing)
+
+    def measure(self, z: Array) -> Array:
+        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
+        return self.end.evaluate(z, z)[0]
+
+    def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
+        """Simulate torques until the end of the passage, or what keeps it from coming."""
+        end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
+        torque = read_rows(make_rows(steps, end))
+        simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
+        self.simulations += 1
+        self.trials.append(self._judge(tuple(steps), simulation))
+        self.options.tell(f"{self.title}: {title}: {self.trials[-1].to_text()}")
+        return self.trials[-1]
+
+    def land(self, steps: Sequence[TuningStep], arrival: float, end: float) -> tuple[Array, str]:
+        """Simulate torques that hold the object from its arrival [s] to an end [s].
+
+        Returns where it is then, (5,), and what does not hold; empty if everything rests and no
+        contact of the next phase, or else of the last one, has parted.
+        """
+        self.simulations += 1
+        simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
+        names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
+        parted = {
+            name: max((b - a for a, b in simulation.list_pauses(name, arrival, end)), default=0.0)
+            for name in names
+        }
+        worst = max(parted, key=parted.__getitem__)
+        if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
+            reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
+        elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
+            reason = "the object does not come to rest there"
+        return simulation.z[-1], reason
+
+    def _is_over(self, run: FreeRun) -> bool:
+        if run.t == 0:
+            return False
+        ends, loss = self.passage.follow(run.events)
+        if run.resting or loss is not None or len(ends) == len(self.passage.phases):
+            return True
+        if len(self.passage.phases) > 1:
+            return False
+        gap = float(self.measure(run.z[None])[0])
+        return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
+
+    def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
+        gaps = self.measure(simulation.z)
+        ends, lost = self.passage.follow(simulation.events)
+        arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
+        if not self.gains and gaps.min() <= 0:
+            row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
+            a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
+            arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
+        before = len(self.passage.phases) - 1
+        start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
+        # When the end, once nearer, is farther away again.
+        rows = np.flatnonzero(simulation.t >= start)
+        risen = gaps[rows] - np.minimum.accumulate(gaps[rows])
+        back = rows[risen > SETTINGS.back * abs(self.way)]
+        turn = float(simulation.t[back].min(initial=math.inf))
+        stop = min(arrival, turn, float(simulation.t[-1]))
+        # When contacts of its phases part, also those that never press.
+        losses = [] if lost is None else [(lost.time, lost.contact)]
+        starts = [0.0, *ends][: len(self.passage.phases)]
+        spans = zip(self.passage.phases, starts, [*starts[1:], stop], strict=False)
+        for phase, first, last in spans:
+            phase_losses = find_losses(simulation, phase, first, last, DEPARTURE)
+            losses += [(loss.time, loss.contact) for loss in phase_losses]
+        losses = [loss for loss in losses if loss[0] < stop]
+        time, contact = min(losses, default=(stop, ""))
+        at = int(np.searchsorted(simulation.t, time))
+        # The step in which a coordinate arrives goes on beyond that.
+        t, c_n = simulation.t[: at + 1].copy(), simulation.c_n[: at + 1].copy()
+        gaps = gaps[: at + 1].copy()
+        if t[at] > time > 0:
+            sample, t[at] = simulation.trajectory.at([time]), time
+            gaps[at] = self.measure(sample.z)[0]
+            pairs = [simulation.trajectory.contacts.index(name) for name in simulation.contacts]
+            c_n[at] = sample.c_n[0, pairs]
+        least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
+        short = float(gaps[t >= start].min(initial=math.inf))
+        if losses:
+            outcome = TrialOutcome.LOSES
+        elif least < self.problem.epsilon:
+            outcome, contact, time = TrialOutcome.LOSES, weakest, float(t[row])
+        elif arrival == stop:
+            outcome = TrialOutcome.ARRIVES
+        else:
+            rests = turn == stop or not simulation.z_dot[at].any()
+            outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
+        rate, slowing, z = self._close(simulation, time, at)
+        return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
+
+    def _find_least(
+        self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]
+    ) -> tuple[float, str, int]:
+        """The least of normal forces over time, of which contact, and in which row."""
+        phases = self.passage.phases
+        of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
+        best = (math.inf, phases[0].formation.names[0], 0)
+        for index, after in enumerate((*phases[1:], self.passage.after)):
+            phase, rows = phases[index], np.flatnonzero(of == index)
+            # Contacts that the phase releases at its end do not count.
+            leaving = list_leaving(phase, after) if phase.until.is_release else set()
+            names = [name for name in phase.formation.names if name not in leaving]
+            columns = [contacts.index(name) for name in names]
+            c_n = np.nan_to_num(forces[rows][:, columns], nan=math.inf)
+            if c_n.min(initial=math.inf) < best[0]:
+                row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
+                best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
+        return best
+
+    def _close(self, run: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
+        """How fast the end closes, by how much that becomes less, and where."""
+        if self.gains or time == 0:
+            z, v, a = (part[[at]] for part in (run.z, run.z_dot, run.z_ddot))
+        else:
+            sample = run.trajectory.at([time])
+            z, v, a = sample.z, sample.z_dot, sample.z_ddot
+        _, (gradient,), (bend,) = self.end.evaluate(z, v)
+        return -float(gradient @ v[0]), float(gradient @ a[0] + bend), z[0]
 
 
 def list_starts(tau: Array, acting: int) -> list[Array]:
