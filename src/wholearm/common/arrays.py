@@ -25,6 +25,24 @@ def sort_unique(values: NDArray[_Number]) -> NDArray[_Number]:
     return ordered[np.diff(ordered, prepend=-np.inf) > 0]
 
 
+class Independent:
+    """Rows that are independent of those before, by more than a share `least` (Gram-Schmidt)."""
+
+    def __init__(self, least: float) -> None:
+        self.least, self.basis = least, list[Array]()
+
+    def add(self, row: Array) -> bool:
+        """Whether a row is; it counts from then on."""
+        rest = row
+        for other in self.basis:
+            rest = rest - (other @ rest) * other
+        left = float(np.linalg.norm(rest))
+        independent = left > self.least * float(np.linalg.norm(row))
+        if independent:
+            self.basis.append(rest / left)
+        return independent
+
+
 def find_runs(flags: NDArray[np.bool_], least: int = 1) -> list[slice]:
     """Runs of True in flags, shape (n,), of `least` places or more."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]]))).tolist()

@@ -18,7 +18,6 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 
 from ..common.arrays import Array
-from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from . import interface as engine
@@ -30,11 +29,8 @@ def play(
     problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
 ) -> engine.EngineRun:
     """Replay a stretch in Drake; an `Engine`."""
-    steps, drive = engine.list_steps(problem, stretch, torque, setting.step), None
-    if isinstance(torque, ClosedLoop):
-        step = _EVERY * steps.h
-        drive = engine.EngineDrive(problem.scene, torque, stretch.duration, step)
-    setting = setting._replace(step=steps.h / problem.scene.scales.time)
+    steps = engine.list_steps(problem, stretch, torque, setting.step, _EVERY)
+    drive, setting = steps.drive, setting._replace(step=steps.h / problem.scene.scales.time)
     # Half spaces touch nothing deformable, which would be a warning.
     log = logging.getLogger("drake")
     level = log.level
@@ -73,7 +69,7 @@ def play(
     def read() -> tuple[Array, Array]:
         return plant.GetPositions(context), plant.GetVelocities(context)
 
-    return engine.record(stretch, steps, engine.list_pairs(problem.scene), drive, advance, read)
+    return engine.record(stretch, steps, engine.list_pairs(problem.scene), advance, read)
 
 
 def _build(

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Independent, sort_unique
 from ..common.errors import InputError, WholearmError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
@@ -170,6 +170,7 @@ class Steps(NamedTuple):
     v: Array  # (5,): velocity half a step before the start
     tau: Array  # (n, 2) [N m]: torques, averaged over half a step before and after each position
     ends: list[int]  # numbers of the steps after which the state is recorded; the last is n
+    drive: EngineDrive | None  # torques by feedback; those of `tau` are zero then
 
 
 class EngineRun(NamedTuple):
@@ -214,31 +215,34 @@ def list_stretches(plan: Trajectory, begins: Sequence[int]) -> list[EngineStretc
     return stretches
 
 
-def list_steps(problem: Problem, stretch: EngineStretch, torque: Drive, step: float) -> Steps:
+def list_steps(
+    problem: Problem, stretch: EngineStretch, torque: Drive, step: float, every: int = 1
+) -> Steps:
     """Even steps that fit a stretch, none longer than `step` times the scene's time.
 
-    Torques by feedback are zero here.
+    Feedback is asked `every` so many steps.
     """
     duration = stretch.stop - stretch.start
     # Contacts oscillate after a jump of torques: that takes some steps.
     count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), 5000)
     h = duration / count
-    tau = np.zeros((count, 2))
-    if isinstance(torque, TorqueProfile):
+    tau, drive = np.zeros((count, 2)), None
+    if isinstance(torque, ClosedLoop):
+        drive = EngineDrive(problem.scene, torque, duration, every * h)
+    else:
         t = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
         samples = torque.at(stretch.start + np.maximum(t, 1e-3 * h))
         tau = np.asarray(samples.reshape(count, _LOOKS, 2).mean(axis=1))
     v = stretch.z_dot - h / 2 * stretch.z_ddot
     rows = min(count, ROWS * len(stretch.phases))
     ends = np.linspace(0, count, rows + 1)[1:].astype(int).tolist()
-    return Steps(h, v, tau, ends)
+    return Steps(h, v, tau, ends, drive)
 
 
 def record(
     stretch: EngineStretch,
     steps: Steps,
     pairs: Sequence[Pair],
-    drive: EngineDrive | None,
     advance: Callable[[int, int], Array],
     read: Callable[[], tuple[Array, Array]],
 ) -> EngineRun:
@@ -252,7 +256,7 @@ def record(
         press.append(advance(start, end))
         states.append(read())
         start = end
-        if drive is not None and drive.loop.over:
+        if steps.drive is not None and steps.drive.loop.over:
             break
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
@@ -310,23 +314,13 @@ def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, f
     contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
     A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     weight = 1 / np.sqrt(scene.mass_diagonal)
-    rows = _list_independent(A * weight, formation.n_contacts)
+    # Of others what is independent: contacts at one place share all of their rows but rounding.
+    independent, count = Independent(0.1), formation.n_contacts
+    rows = [k for k, row in enumerate(A * weight) if independent.add(row) or k < count]
     depth = np.full(len(contacts), -3e-7 * scene.scales.length)
     for k, name in enumerate(formation.names):
         depth[k] = stretch.c_n[name] / stiffness[name]
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
-
-
-def _list_independent(rows: Array, kept: int) -> list[int]:
-    """The first `kept` rows, and those of the others that are independent of the rows before."""
-    unit, chosen = rows / np.linalg.norm(rows, axis=1)[:, None], list(range(kept))
-    for row in range(kept, len(rows)):
-        basis = unit[chosen]
-        rest = unit[row] - np.linalg.pinv(basis) @ (basis @ unit[row])
-        # Contacts at one place share all of their rows but rounding.
-        if np.linalg.norm(rest) > 0.1:
-            chosen.append(row)
-    return chosen
 
 
 class EngineDrive:

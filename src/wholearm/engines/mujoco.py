@@ -14,7 +14,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..common.arrays import Array
-from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.torque import place_rows
@@ -221,9 +220,7 @@ def play(
     import mujoco
 
     steps = engine.list_steps(problem, stretch, torque, setting.step)
-    drive = None
-    if isinstance(torque, ClosedLoop):
-        drive = engine.EngineDrive(problem.scene, torque, stretch.duration, steps.h)
+    drive = steps.drive
     text = write_mjcf(problem, step=steps.h, softness=setting.softness)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -270,8 +267,7 @@ def play(
     data.qpos[:], data.qvel[:] = engine.press_in(problem, stretch, shares), steps.v
     # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
     mujoco.set_mju_user_warning(lambda _: None)
-    run = engine.record(
-        stretch, steps, pairs, drive, advance, lambda: (data.qpos.copy(), data.qvel.copy())
-    )
+    state = lambda: (data.qpos.copy(), data.qvel.copy())  # noqa: E731
+    run = engine.record(stretch, steps, pairs, advance, state)
     mujoco.set_mju_user_warning(None)
     return run

@@ -30,7 +30,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Expression, find_root
+from ..common.arrays import Array, Expression, Independent, find_root
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
@@ -87,6 +87,16 @@ class ContactProblem:
             return False
         K = self.scaled[2]
         return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
+
+    def describe(self, answer: ContactAnswer) -> list[int]:
+        """Modes of an answer as `list_answers` has them."""
+        choice = [STICKS if c > 0 else APART for c in answer.c_n]
+        for owner, sign in zip(self.owner.tolist(), answer.sign.tolist(), strict=True):
+            if owner < 0:
+                choice.append(MODES[sign])
+            elif choice[owner] != APART:
+                choice[owner] = MODES[sign]
+        return choice
 
 
 class ContactAnswer(NamedTuple):
@@ -324,35 +334,16 @@ class Pattern:
         ]
         return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
 
-    def describe(self, answer: ContactAnswer) -> list[int]:
-        """Modes of an answer as `list_answers` has them."""
-        choice = [STICKS if c > 0 else APART for c in answer.c_n]
-        signs = [MODES[sign] for sign in answer.sign.tolist()]
-        for k, mode in zip(self.standing, signs, strict=False):
-            if choice[k] != APART:
-                choice[k] = mode
-        return choice + signs[len(self.standing) :]
-
     def make_modes(self, answer: ContactAnswer, at: ContactRows) -> Modes:
         """Independent constraints, of rows `at` a state, that give the answer's motion."""
         system, closed = self.system, self.closed
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
         order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
-        root = np.sqrt(system.mass)
-        basis: list[Array] = []
+        rows, root = Independent(DEPENDENT), np.sqrt(system.mass)
 
         def adds(row: Array) -> bool:
-            """Whether a row is a constraint of its own; it counts from then on."""
-            row = row / root
-            size, rest = float(np.linalg.norm(row)), row.copy()
-            for other in basis:
-                rest = rest - (other @ rest) * other
-            left = float(np.linalg.norm(rest))
-            if left <= DEPENDENT * size:
-                return False
-            basis.append(rest / left)
-            return True
+            return rows.add(row / root)
 
         kept = {k for k in order if presses[k] and adds(at.A[k])}
         count, stuck, held = len(self.standing), [], []
@@ -372,9 +363,9 @@ class Pattern:
                     stuck.append(k)
         # What touches without a force stays, for as long as it needs none.
         kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(at.A[k])}
-        rows = sorted(kept)
-        pairs, stick = tuple(closed[k] for k in rows), sorted((closed[k],) for k in stuck)
-        signs = tuple(Xi[rows].tolist()), tuple(sigma.tolist())
+        order = sorted(kept)
+        pairs, stick = tuple(closed[k] for k in order), sorted((closed[k],) for k in stuck)
+        signs = tuple(Xi[order].tolist()), tuple(sigma.tolist())
         return Modes(pairs, tuple(stick), tuple(sorted(held)), *signs)
 
 
@@ -575,10 +566,7 @@ class FreeRun(Run):
             return False
         # With the modes that it ends in, the impact at the instant itself is linear.
         problem = self._pose(closed, self.v)
-        choice = [STICKS if c > 0 else APART for c in answer.c_n]
-        for contact, sign in zip(problem.owner, answer.sign, strict=True):
-            choice[contact] = MODES[float(sign)] if choice[contact] != APART else APART
-        exact = list_answers(problem, choice)
+        exact = list_answers(problem, problem.describe(answer))
         if not exact or system.is_slower(exact[0].change, STANDING):
             return False
         names = " ".join(system.names[pair] for pair in pattern.closed)
@@ -654,14 +642,14 @@ class FreeRun(Run):
         self.unique = problem.is_unique
         answers = [] if self.unique else list_answers(problem)
         if len(answers) > 1:
-            modes = [pattern.describe(answer) for answer in answers]
+            modes = [problem.describe(answer) for answer in answers]
             if self.modes.kept or len(problem.b_n):
                 self._note_ambiguity(pattern, modes)
             starts = [self.resting and not self._is_still(free + a.change) for a in answers]
             away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
             return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
-        likely = last, pattern.describe(before)
-        if answers and pattern.describe(answers[0]) in likely:
+        likely = last, problem.describe(before)
+        if answers and problem.describe(answers[0]) in likely:
             return answers[0]
         return self._answer(problem, *likely)
 
