@@ -868,12 +868,13 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from ..engines.engine_replay import ALLOWED, ENGINES, require_engine
+    from ..engines.engine_replay import ALLOWED, require_engine
+    from ..engines.interface import Setting
 
     require_engine(options.engine)
     problem, plan, policy, notes = _load_replayed(options, options.json)
-    setting = ENGINES[options.engine].setting
     _check_step(options, problem)
+    setting = Setting()
     if options.step is not None:
         setting = setting._replace(step=options.step / problem.scene.scales.time)
     if options.softness is not None:

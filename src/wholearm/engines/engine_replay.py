@@ -47,14 +47,13 @@ class EngineInfo(NamedTuple):
     title: str
     package: str  # that it is imported from
     allowed: float  # error of the pose, over the scene's length and in rad
-    setting: Setting
 
 
 ENGINES = {
-    "mujoco": EngineInfo("MuJoCo", "mujoco", 3e-3, Setting(1.6e-4)),
-    "drake": EngineInfo("Drake", "pydrake", 1.5e-3, Setting(1.6e-4)),
+    "mujoco": EngineInfo("MuJoCo", "mujoco", 3e-3),
+    "drake": EngineInfo("Drake", "pydrake", 1.5e-3),
 }
-"""In the scenes of `problems/` 3e-3 are 0.1 mm and 0.17 degrees, and steps take 1e-5 s."""
+"""In the scenes of `problems/` 3e-3 are 0.1 mm and 0.17 degrees."""
 
 
 class Force(NamedTuple):
@@ -216,7 +215,7 @@ def replay_in(
     ----------
     engine : {"mujoco", "drake"}
     whole      from start to end; otherwise phase by phase, each from its planned start
-    setting    time step and softness of contacts; by default those of `ENGINES`
+    setting    time step and softness of contacts
     allowed    error of the pose, over the scene's length and in rad; by default that of `ENGINES`
     halvings   number of halvings of the step, with harder contacts and with the same
 
@@ -227,7 +226,7 @@ def replay_in(
     info = ENGINES[engine]
     problem, plan = adopt_motion(problem, plan)
     require_same_phases(problem, plan)
-    setting = info.setting if setting is None else setting
+    setting = setting or Setting()
     allowed = info.allowed if allowed is None else allowed
     plan = find_between(plan)
     torque = apply_friction(problem.scene, plan)
@@ -433,7 +432,7 @@ def play_policy(
         fault = f"{policy.count} given; the problem has {len(problem.phases)}"
         raise InputError("", "phases of the policy", fault)
     info = ENGINES[engine]
-    setting = info.setting if setting is None else setting
+    setting = setting or Setting()
     arrivals = []
     # From rest; what comes to rest a little late in the replay still moves.
     begins, rest = [0] if whole else [number - 1 for number in policy.resting], np.zeros(5)

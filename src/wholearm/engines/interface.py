@@ -155,7 +155,7 @@ class EngineStretch(NamedTuple):
 class Setting(NamedTuple):
     """Discretization of an engine."""
 
-    step: float  # time step, over the scene's time
+    step: float = 1.6e-4  # time step, over the scene's time: 1e-5 s in the scenes of `problems/`
     softness: float = 1.0  # of contacts, over the engine's default, which is in proportion to step
 
 

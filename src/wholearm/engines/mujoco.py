@@ -27,7 +27,6 @@ BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
 CLOCK = "clock"
 HIDDEN = {"group": 3}
 """Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
-STEP = 1.6e-4  # Time step, over the scene's time: 1e-5 s in the scenes of `problems/`
 # In a convex contact model sliding separates the surfaces at a rate that falls with the time
 # constant of friction and with the impedance.
 PRESS = 7.5  # time constant of the gap (critically damped), in time steps
@@ -49,7 +48,7 @@ def write_mjcf(
     ----------
     plan        its torques are part of the model, and each of its phases has a keyframe at its
                 start
-    step : [s]  `STEP` of the scene's time when left out
+    step : [s]  that of `Setting` when left out
     softness    factor of the time constants of contacts
 
     InputError if a link has no thickness.
@@ -59,7 +58,7 @@ def write_mjcf(
         problem, plan = adopt_motion(problem, plan)
         home = plan.z[0]
     root = Element("mujoco", model=problem.name)
-    step = STEP * scene.scales.time if step is None else step
+    step = engine.Setting().step * scene.scales.time if step is None else step
     _add_options(root, scene, step)
     world = add(root, "worldbody")
     reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
