@@ -42,21 +42,8 @@ from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
+from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
-from .modes import (
-    Collapse,
-    Mode,
-    StartDeparture,
-    Unit,
-    close_contacts,
-    evaluate_rows,
-    find_fixed,
-    find_mode,
-    find_rest,
-    list_modes,
-    list_units,
-    respond,
-)
 from .run import Run, StuckError
 from .stepper import INNER_STAGES, NODES, ModeStepper, bind
 from .system import (
@@ -106,7 +93,7 @@ class LegRows(NamedTuple):
 class ModeSegment(NamedTuple):
     """A part of a phase with one set of contact modes."""
 
-    mode: Mode
+    mode: modes.Mode
     rows: LegRows
     slack: Array  # (m,): how far below zero each event value counts as rounding
     # sets `event_values` from outputs of the steps and the `heading` at their start
@@ -121,7 +108,7 @@ class ModeSegment(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _build_leg(
-    formation: Formation, until: Until, side: float, s: ModeStepper, mode: Mode
+    formation: Formation, until: Until, side: float, s: ModeStepper, mode: modes.Mode
 ) -> ModeSegment:
     """A segment with the steps of its mode, before it gets a phase and a number."""
     scene, layout = formation.scene, s.rows
@@ -232,7 +219,7 @@ class Replay(Run):
         inputs, at = self.s.inputs, self.s.at
         inputs[at.Xi], inputs[at.sigma][3:] = signs[:-2], signs[-2:]
 
-    def take(self, mode: Mode) -> None:
+    def take(self, mode: modes.Mode) -> None:
         """Go on with the steps of a mode of the phase's formation."""
         self.load(mode.find_modes())
         self.signs = np.zeros(self.formation.n_contacts + 2)
@@ -402,7 +389,7 @@ class Replay(Run):
         self.record(still=True)
         if self.is_there():
             return self._arrive(self.rest_window)
-        rest = find_rest(self.formation, self.z)
+        rest = modes.find_rest(self.formation, self.z)
         sticks = False
         while True:
             if self.t >= self.breaks[-1]:
@@ -410,15 +397,15 @@ class Replay(Run):
             if self.t >= self.held_until:
                 x = min(1.0, max(-1.0, self.fraction(self.t)))
                 change = rest.wait(self.torque.coefficients[self.piece], x)
-                if isinstance(change, StartDeparture) and change.x <= x:
+                if isinstance(change, modes.StartDeparture) and change.x <= x:
                     return self.set_off(change)
                 if not sticks:
                     self.note(EventKind.STICK, "the object sticks")
                 sticks = True
-                if isinstance(change, StartDeparture):
+                if isinstance(change, modes.StartDeparture):
                     self.wait(self.time(change.x))
                     return self.set_off(change)
-                if isinstance(change, Collapse):
+                if isinstance(change, modes.Collapse):
                     # Balance may be lost where the torques are about to step or to be the next
                     # phase's.
                     t = self.time(change.x)
@@ -430,7 +417,7 @@ class Replay(Run):
                 self.wait(self.stop)
                 self.next_piece()
 
-    def _collapse(self, change: Collapse) -> Ending:
+    def _collapse(self, change: modes.Collapse) -> Ending:
         """End because nothing balances at rest."""
         self.wait(max(self.t, self.time(change.x)))
         if change.jammed:
@@ -642,7 +629,7 @@ class Replay(Run):
             row, value = until.poses[0]
             self.side = math.copysign(1.0, self.y[row] - value)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
-        self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
+        self.take(modes.find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
@@ -658,7 +645,7 @@ class Replay(Run):
     def _close(self, formation: Formation) -> Array:
         """The present configuration with every contact of a formation closed."""
         try:
-            return close_contacts(formation, self.z, 10 * REACHED * self.system.scales.length)
+            return modes.close_contacts(formation, self.z, 10 * REACHED * self.system.scales.length)
         except SimulationError as error:
             raise SimulationError(f"{error} {self.when()}") from None
 
@@ -680,22 +667,22 @@ class Replay(Run):
         self.set_velocity(impact.v)
         return None
 
-    def set_off(self, departure: StartDeparture) -> Ending:
+    def set_off(self, departure: modes.StartDeparture) -> Ending:
         """Move from rest, with the friction signs of the start."""
         if not self.gets_on():
             raise SimulationError(f"starting and stopping do not end {self.when()}")
         self.note(EventKind.START, "the object starts to move")
         formation, signs = self.formation, departure.signs
-        mode = find_mode(formation, signs)
+        mode = modes.find_mode(formation, signs)
         if formation.n_constraints < 4:
-            fixed = find_fixed(mode, evaluate_rows(formation, self.z, self.v))
-            gripped = (row for u in list_units(formation) if u.grips for row in u.rows)
+            fixed = modes.find_fixed(mode, modes.evaluate_rows(formation, self.z, self.v))
+            gripped = (row for u in modes.list_units(formation) if u.grips for row in u.rows)
             self.stuck = {row for row in gripped if fixed[row]}
         self.start_with(mode, signs, departure.heading)
         self.observe()
         return self.move()
 
-    def start_with(self, mode: Mode, signs: Array, heading: Array) -> None:
+    def start_with(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
         """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
         if mode != self.leg.mode:
             self.take(mode)
@@ -706,8 +693,8 @@ class Replay(Run):
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
         self.leg.heading[:] = v / np.sqrt(self.system.mass @ v**2)
-        rates = np.concatenate([evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
-        movable = [row for unit in list_units(formation) for row in unit.rows]
+        rates = np.concatenate([modes.evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
+        movable = [row for unit in modes.list_units(formation) for row in unit.rows]
         signs = np.zeros(len(rates))
         signs[movable] = np.where(rates < 0, -1.0, 1.0)[movable]
         for name, sign in self.slip_signs.items():
@@ -760,7 +747,7 @@ class Replay(Run):
         slow = np.abs(self.values[self.leg.rows.turning]) < STANDING
         still = [
             unit
-            for unit in list_units(formation)
+            for unit in modes.list_units(formation)
             if set(unit.rows) & set(turned) or (unit.grips and slow[list(unit.rows)].any())
         ]
         if not still:
@@ -771,8 +758,8 @@ class Replay(Run):
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
         chosen, mode = self._choose(signs, still)
-        rows = evaluate_rows(formation, self.z, self.v)
-        fixed = find_fixed(mode, rows)
+        rows = modes.evaluate_rows(formation, self.z, self.v)
+        fixed = modes.find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
         gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
         first = np.array([unit.rows[0] for unit in still])
@@ -906,14 +893,14 @@ class Replay(Run):
         kind, text = describe_change(name, before, after, "slides" if contact else "turns")
         self.note(kind, text, name)
 
-    def _choose(self, signs: Array, still: Sequence[Unit]) -> tuple[Array, Mode]:
+    def _choose(self, signs: Array, still: Sequence[modes.Unit]) -> tuple[Array, modes.Mode]:
         """The most consistent signs of what stands still; `JammingError` without any."""
         formation, scales, ahead = self.formation, self.system.scales, self.settling
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
-        present, count = evaluate_rows(formation, self.z, self.v), formation.n_contacts
+        present, count = modes.evaluate_rows(formation, self.z, self.v), formation.n_contacts
         speeds, ratios = np.repeat([scales.speed, scales.rate], [count, 2]), [1.0]
 
-        def measure(signs: Array, mode: Mode) -> tuple[float, float] | None:
+        def measure(signs: Array, mode: modes.Mode) -> tuple[float, float] | None:
             """Least margin of acceleration along the signs or of friction, and least c_n, relative.
 
             None if the combination jams or leaves its forces undetermined.
@@ -922,8 +909,8 @@ class Replay(Run):
             for delay, load in zip((0.0, ahead), loads, strict=True):
                 v = self.v + delay * acceleration
                 z = self.z + delay * (self.v + v) / 2
-                rows = evaluate_rows(formation, z, v) if delay else present
-                response = respond(mode, signs, rows, v)
+                rows = modes.evaluate_rows(formation, z, v) if delay else present
+                response = modes.respond(mode, signs, rows, v)
                 if response is None or not response.ratio > 0:
                     ratios.extend([] if response is None else [response.ratio])
                     return None
@@ -942,7 +929,7 @@ class Replay(Run):
             return float(min(margins)), float(held[:count].min())
 
         options = [(1.0, -1.0, 0.0) if unit.grips else (1.0, -1.0) for unit in still]
-        patterns = list(list_modes(formation, signs, still, options))
+        patterns = list(modes.list_modes(formation, signs, still, options))
         measured = [(measure(*pattern), pattern) for pattern in patterns]
         choices = [(*margins, pattern) for margins, pattern in measured if margins is not None]
         pressing = [choice for choice in choices if min(choice[:2]) > -CLEAR]

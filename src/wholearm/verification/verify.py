@@ -25,16 +25,8 @@ from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
+from ..simulation import modes
 from ..simulation.events import EventKind, Simulation
-from ..simulation.modes import (
-    Response,
-    StartMode,
-    evaluate_rows,
-    find_rest,
-    list_modes,
-    list_units,
-    respond,
-)
 from ..simulation.simulate import simulate
 from ..simulation.system import SETTLING
 from . import verdict
@@ -560,7 +552,7 @@ def _examine_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        paths = list(find_rest(formation, z).list_modes())
+        paths = list(modes.find_rest(formation, z).list_modes())
         free = [path for path in paths if path.slides(tau)]
         worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
         response = None if worst is None else worst.response
@@ -586,7 +578,7 @@ def _examine_loss(
 
 
 def list_changes(
-    response: Response, v: Array, epsilon: float, contact: str, tau: Array
+    response: modes.Response, v: Array, epsilon: float, contact: str, tau: Array
 ) -> tuple[results.TorqueAdvice, ...]:
     """Least changes of each torque alone that a moving contact is kept with, or of both.
 
@@ -651,7 +643,7 @@ def find_approach(simulation: Simulation) -> results.Approach | None:
 
 def find_resting_changes(
     formation: Formation,
-    paths: Sequence[StartMode],
+    paths: Sequence[modes.StartMode],
     epsilon: float,
     z: Array,
     tau: Array,
@@ -670,7 +662,7 @@ def find_resting_changes(
     gradient : (5,)   of the distance to the end of the phase, if that is known
     """
     limits, unit = make_limits(formation, epsilon), formation.scene.scales.torque
-    starts = list[tuple[StartMode, tuple[Array, Array]]]()
+    starts = list[tuple[modes.StartMode, tuple[Array, Array]]]()
     for path in paths:
         towards = [] if gradient is None else [-gradient @ path.response.acceleration]
         rows = np.vstack([path.margins, *towards])
@@ -693,7 +685,7 @@ def find_resting_changes(
     return tuple(sorted(changes, key=lambda change: (change.holds, np.hypot(*change.change))))
 
 
-def find_sides(limits: LimitSet, response: Response, v: Array) -> Array:
+def find_sides(limits: LimitSet, response: modes.Response, v: Array) -> Array:
     """Slack of one-sided limits at velocity v, (5,), rows @ (1, tau_1, tau_2), (n_sides, 3)."""
     formation = response.mode.formation
     of_c, of_tau, of_rates = limits.columns
@@ -709,24 +701,24 @@ def find_sides(limits: LimitSet, response: Response, v: Array) -> Array:
 
 def find_moving(
     formation: Formation, z: Array, v: Array, tau: Array, acceleration: Array
-) -> Response | None:
+) -> modes.Response | None:
     """The mode of a motion; where something stands still, with the friction that it had.
 
     That is the friction with which torques `tau` give the recorded `acceleration`, shape (5,).
     """
-    scene, rows = formation.scene, evaluate_rows(formation, z, v)
+    scene, rows = formation.scene, modes.evaluate_rows(formation, z, v)
     speeds = np.concatenate([rows.A_t @ v, v[3:]])
     units = np.repeat([scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2])
     slow = np.abs(speeds) < 1e-6 * units
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
-    still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
+    still = [unit for unit in modes.list_units(formation) if slow[list(unit.rows)].all()]
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    modes = list_modes(formation, signs, still, options)
-    tried = (respond(mode, signs, rows, v) for signs, mode in modes)
+    patterns = modes.list_modes(formation, signs, still, options)
+    tried = (modes.respond(mode, signs, rows, v) for signs, mode in patterns)
 
-    def misfit(response: Response) -> float:
+    def misfit(response: modes.Response) -> float:
         off = response.acceleration @ [1.0, *tau] - acceleration
         return float(scene.mass_diagonal @ off**2)
 
