@@ -759,7 +759,7 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
     """One panel; hollow markers are settings with which some phases are not solved."""
     planning = study in PLANNING
     for index, (method, mine) in enumerate(_group(rows, study).items()):
-        points, full = [], []
+        points, hollow = list[tuple[float, float]](), list[tuple[float, float]]()
         for setting in dict.fromkeys(row["setting"] for row in mine):
             group = [row for row in mine if row["setting"] == setting]
             finite_rows = [row for row in group if np.isfinite(row["errors"][0])]
@@ -768,23 +768,19 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
             error = float(np.median([abs(row["errors"][0]) for row in finite_rows]))
             seconds = find_mean([row["solve"] + planning * row["build"] for row in finite_rows])
             points.append((max(error, 1e-16), seconds))
-            full.append(all(row["outcome"] == SOLVED for row in group))
-        if not points:
-            continue
+            hollow += points[-1:] * any(row["outcome"] != SOLVED for row in group)
         look: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
-        axes.plot(*zip(*points, strict=True), label=method, **look)
-        hollow = [point for point, whole in zip(points, full, strict=True) if not whole]
-        if hollow:
-            look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
-            axes.plot(*zip(*hollow, strict=True), **look)
+        axes.plot(*np.reshape(points, (-1, 2)).T, label=method, **look)
+        look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
+        axes.plot(*np.reshape(hollow, (-1, 2)).T, **look)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_title(f"{study[0].upper()}{study[1:]}")
     what = "relative error of the phase time" if planning else "error of z and z' in scene units"
     axes.set_xlabel(f"{what}, median over phases [-]")
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
+    axes.grid(True, which="major", color=GRID, linewidth=0.6)
     if axes.lines:
-        axes.grid(True, which="major", color=GRID, linewidth=0.6)
         axes.legend(fontsize=8, ncols=2)
 
 

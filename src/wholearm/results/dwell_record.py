@@ -164,9 +164,7 @@ class SettledMotion:
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        moves = np.minimum(t, self.motion.duration)
-        held = np.asarray(t > self.motion.duration)
-        return _stop(self.motion.evaluate(moves), held, self._hold(t))
+        return self._take(t, np.asarray(t > self.motion.duration))
 
     def sample(self, count: int) -> tuple[Array, Samples]:
         """`count` even rows of the motion, and the two ends of the time in which it is held.
@@ -176,22 +174,16 @@ class SettledMotion:
         end = self.motion.duration
         inner = [end + self.ramp] if self.ramp else []
         t = np.append(np.linspace(0.0, end, count), [end, *inner, self.duration])
+        return t, self._take(t, np.asarray(np.arange(len(t)) >= count))
+
+    def _take(self, t: Array, held: NDArray[np.bool_]) -> Samples:
+        """Samples at times from the start of the phase, at rest where the end is held."""
+        end, rows = self.motion.duration, held[:, None]
         samples = self.motion.evaluate(np.minimum(t, end))
-        return t, _stop(samples, np.asarray(np.arange(len(t)) >= count), self._hold(t))
-
-    def _hold(self, t: Array) -> Array:
-        """Torques at times from the start of the phase on, as if it were held then."""
-        if not self.ramp:
-            return self.tau
-        return self.torque.at(np.clip(t - self.motion.duration, 0.0, self.held))
-
-
-def _stop(samples: Samples, held: NDArray[np.bool_], tau: Array) -> Samples:
-    """The samples with those at rest that are held."""
-    rows = held[:, None]
-    z_dot, z_ddot = (np.where(rows, 0.0, part) for part in (samples.z_dot, samples.z_ddot))
-    forces = (np.where(rows, np.nan, part) for part in (samples.c_n, samples.c_t))
-    return Samples(samples.z, z_dot, z_ddot, np.where(rows, tau, samples.tau), *forces)
+        tau = self.torque.at(np.clip(t - end, 0.0, self.held)) if self.ramp else self.tau
+        z_dot, z_ddot = (np.where(rows, 0.0, part) for part in (samples.z_dot, samples.z_ddot))
+        forces = (np.where(rows, np.nan, part) for part in (samples.c_n, samples.c_t))
+        return Samples(samples.z, z_dot, z_ddot, np.where(rows, tau, samples.tau), *forces)
 
 
 def assemble(
