@@ -62,8 +62,7 @@ PROBLEM = "problem  problem file (TOML)\n"
 PLAN = "plan  trajectory file (.npz)\n"
 JSON = "--json  print the result as JSON\n"
 SQUEEZE = """\
---squeeze  how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps
-    = 0.5 in 0.0..1.0
+--squeeze  of quasistatic torques: 0 as little as needed, 1 as hard as helps = 0.5 in 0.0..1.0
 """
 POLICY = """\
 --policy FILE  torques by this policy (.npz), at its own period, instead of the plan's by the clock
@@ -72,8 +71,7 @@ SENSOR = "--sensor  with --policy: measured normal forces are handed to it, exac
 SEARCH = """\
 --cache DIR       folder to keep what is found out of the scene, for later searches for a goal
     (none); nobody else may write there
---jobs N          processes that a search for a [goal] uses (2, or 1 where there is one core)
-    in 1..256
+--jobs N          processes of a search for a [goal] (2, or 1 where there is one core) in 1..256
 --time-limit S    longest time that this may take; a search then returns the best route so far
     (none) in 1e-3..1e9
 """
@@ -87,8 +85,7 @@ TABLE = f"""\
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
 --size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
---vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
-    0.08,0.03 0,0.09'
+--vertices 'X,Y ...'  corners instead, anticlockwise [m], as in '0,0 0.08,0 0.04,0.06'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
 [[schema]]  print the JSON Schema of problem files, for editors
 -o --output FILE  file to write, instead of printing
@@ -97,8 +94,7 @@ name               the problem's name; NAME.toml is written
 {PROBLEM}\
 -o --output FILE        trajectory file to write (default: NAME.npz)
 --torques FILE          also write the torques as CSV
---sample-rate HZ        write samples at this rate [Hz] instead, and say what becomes of the motion
-    (none) in 1e-9..1e12
+--sample-rate HZ        write samples at this rate, and replay them [Hz] (none) in 1e-9..1e12
 --interpolation NAME    of samples: linear, or hold for sample-and-hold (linear)
 {PLANNER}{MARGIN}{SEARCH}{JSON}\
 [[verify]]  replay torques open loop and check the motion
@@ -107,14 +103,11 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
 --departure       how far the replay may be from the plan, over the object's radius of gyration, and
     in rad (1e-3) in 1e-9..1e3
---rest-speed      speed that passes for rest, over the root of that radius times gravity (2e-2)
-    in 1e-9..1e3
+--rest-speed      speed that passes for rest, over sqrt(that radius times g) (2e-2) in 1e-9..1e3
 {MARGIN}\
 --reduced         also list the paper's scalar equation of motion where a phase has four constraints
---free            simulate without telling which contacts hold: whole, and a plan's phases one by
-    one too
---policy FILE     with --free: torques by this policy (.npz) instead of the plan's, from the start
-    on
+--free            simulate without given contacts: whole, and a plan's phases one by one
+--policy FILE     with --free: torques by this policy (.npz) instead of the plan's
 {SENSOR}\
 --restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
 -o --output FILE  trajectory file to write (.npz) of the replayed motion, for plot
@@ -123,8 +116,7 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
---simulate [free]  overlay the simulated forces; free: simulated without telling which contacts hold
-    among told|free
+--simulate [free]  overlay the simulated forces; free: without given contacts among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
 [[predict]]  see up to which speed slow motions keep every contact
@@ -132,15 +124,13 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
 --torques FILE    write the quasistatic torques as CSV, which hand tuning starts from
---speed V         mean speed along the phases for these [m/s], over which they are spread in time
-    (0.05) in 1e-9..1e6
+--speed V         mean speed at which these go along the phases [m/s] (0.05) in 1e-9..1e6
 {JSON}\
 [[tune]]  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
---stops N         with --brake: let a phase that fails stop up to N times on its way, 0 to 7
-    = 0 in 0..7
+--stops N         with --brake: let a phase that fails stop up to N times on its way = 0 in 0..7
 {SQUEEZE}\
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
@@ -174,8 +164,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --whole           from start to end, instead of phase by phase from each planned start
 {POLICY}\
 --step            longest time step [s] (from the scene) in 1e-15..1e6
---softness        softness of contacts, over the default, which is in proportion to the step (1)
-    in 1e-6..1e6
+--softness        of contacts, over the default, which is proportional to the step (1) in 1e-6..1e6
 --departure       how far a replay may be from the plan, over the object's radius of gyration, and
     in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
@@ -188,8 +177,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     friction and torques take away (2.5); 0 is as fast as the plan in 0.0..1e3
 --period          of the control loop [s] = 1e-3 in 1e-5..10
 --delay           time from measuring to when torques take effect [s] = 5e-4 in 0.0..10
---torque-limit    of both fingers, if it is more than the plan was made with [N m] (default: the
-    same) in 1e-12..1e12
+--torque-limit    of both fingers, if more than the plan's [N m] (the same) in 1e-12..1e12
 --largest         also look for how many times as wide ranges a policy can keep contacts in
 --departure       how far contacts may open in its simulation, over the object's radius of gyration
     (1e-3) in 1e-9..1e3
@@ -199,14 +187,12 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808
---phase K             only this phase, from its planned start at rest (default: the whole plan)
-    in 1..1000
+--phase K             only this phase, from its planned start at rest (the whole plan) in 1..1000
 {POLICY}{SENSOR}\
 --vary NAME=WIDTH ...  half widths of ranges, instead of the problem's: mass, inertia (0.05),
     friction (0.1), gain of the torques (0.01), all relative; geometry, start_x [m] (6e-3 radii of
     gyration), delay (1e-3 s); 0 leaves a number as it is
---sample-rate HZ      of a sample-and-hold of the torques [Hz], 0 for torques as planned
-    = 1000 in 0.0..1e6
+--sample-rate HZ      of a sample-and-hold of torques [Hz], 0 as planned = 1000 in 0.0..1e6
 --tolerance           of the simulations, relative to the scene's scales = 1e-6 in 1e-14..1e-2
 --goal-distance M     how far from the plan's end the goal counts as reached [m] (0.03 radii of
     gyration) in 1e-9..1e6
@@ -223,8 +209,7 @@ problems PROBLEM ...   problem files (TOML)
 --vary NAME=VALUES ...  what is varied, by the names of Problem.with_: LOW:HIGH:COUNT, or
     VALUE,VALUE,... of numbers or words, as in torque_limit=1:3:5 phases[5].until.phi_deg=-50,-45;
     LOW:HIGH with --samples
---samples N            points of a Latin hypercube of all ranges in place of the grid = 0
-    in 0..1000000
+--samples N            points of a Latin hypercube in place of the grid = 0 in 0..1000000
 --seed K               of the samples = 0 in 0..9223372036854775808
 --with CHECKS          what plans are tried with: verify, free, policy, or several with commas
 -o --output FILE       table to write (.csv; default: NAME_PARAMETERS.csv). Rows are kept in a
@@ -253,8 +238,7 @@ problems PROBLEM ...   problem files (TOML), for one hand
 --weights W ...        weights of several problems (equal ones) in 1e-6..1e6
 --worst                of several problems let the worst one count, and not the weighted sum
 --starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
---budget N             most hands of each search, and most until its first feasible one = 80
-    in 1..100000
+--budget N             most hands of a search, and before its first feasible one = 80 in 1..100000
 -o --output FILE       problem file to write (.toml; default: NAME_design.toml); of several problems
     that of the first one
 --figure FILE          also draw the path of the search (.png, .pdf, .svg)
@@ -262,11 +246,9 @@ problems PROBLEM ...   problem files (TOML), for one hand
 {PLANNING.replace(OBJECTIVE, "")}{JSON}\
 [[animate]]  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
--o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
-    (required)
+-o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html for any browser (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
---simulate [free]  draw the simulated motion behind; free: simulated without telling which contacts
-    hold among told|free
+--simulate [free]  draw the simulated motion behind; free: without given contacts among told|free
 [[report]]  put a problem and its plans into one page to open anywhere
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
@@ -274,8 +256,7 @@ trajectory         trajectory file (.npz)
 --sensitivities   also show what 1 percent more of each number of the problem is worth
 [[gallery]]  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
--o --output FILE   page to write (.md); figures and movies go to a folder beside it
-    = results/gallery.md
+-o --output FILE   page to write (.md), with a folder of pictures beside it = results/gallery.md
 [[help]]  print a page of the documentation, or list its topics
 [topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
 [[completion]]  print what makes a shell complete all this
