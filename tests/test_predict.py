@@ -35,7 +35,7 @@ from wholearm.analysis.tuning import FACTOR, TrialOutcome, split_passages
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.figures import plots
-from wholearm.figures.analysis_figures import draw_comparison
+from wholearm.figures.result_figures import draw_comparison
 from wholearm.mechanics.dynamics import force_rows
 from wholearm.mechanics.limits import force_limit_rows
 from wholearm.problem.read import build_problem, name_keys

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     )
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
-    from .design.figures import draw_sweep
     from .design.hand import Design, design_hand
     from .design.sensitivities import Sensitivities, find_sensitivities
     from .design.sweep import Sweep, sweep
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from .engines.mujoco import write_mjcf
     from .figures import plots
     from .figures.map_figure import draw_map
+    from .figures.result_figures import draw_sweep
     from .geometry.tracing import load
     from .mapping.formation_list import format_route, list_formations
     from .mapping.formation_map import FormationMap, build_map
@@ -72,10 +72,10 @@ _NAMES = {
     "design.hand": "Design design_hand",
     "design.sensitivities": "Sensitivities find_sensitivities",
     "design.sweep": "Sweep sweep",
-    "design.figures": "draw_sweep",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
     "engines.mujoco": "write_mjcf",
     "figures.map_figure": "draw_map",
+    "figures.result_figures": "draw_sweep",
     "geometry.tracing": "load",
     "mapping.formation_list": "format_route list_formations",
     "mapping.formation_map": "FormationMap build_map",

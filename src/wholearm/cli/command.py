@@ -665,7 +665,7 @@ def _predict(options: argparse.Namespace) -> int:
     require_with(options, "torques", "speed")
     problem = read_problem(options)
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress())
-    save_figure(options.output, "figures.analysis_figures:draw_prediction", prediction)
+    save_figure(options.output, "figures.result_figures:draw_prediction", prediction)
     status = finish(options, prediction)
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
@@ -687,7 +687,7 @@ def _compare(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem = wholearm.load(options.problem)
     comparison = wholearm.compare(problem, options.files, show_progress())
-    save_figure(options.output, "figures.analysis_figures:draw_comparison", comparison)
+    save_figure(options.output, "figures.result_figures:draw_comparison", comparison)
     return finish(options, comparison, options.output)
 
 
@@ -728,7 +728,7 @@ def _robustness(options: argparse.Namespace) -> int:
         start=choose_workers(options),
         progress=show_progress(),
     )
-    save_figure(options.figure, "figures.analysis_figures:draw_robustness", study)
+    save_figure(options.figure, "figures.result_figures:draw_robustness", study)
     return finish(options, study, output, options.figure, notes=notes)
 
 
@@ -957,7 +957,7 @@ def _sweep(options: argparse.Namespace) -> int:
     require_output(output, ".csv")
     require_output(options.figure)
     if options.figure is not None:
-        from ..design.figures import choose_axes
+        from ..figures.result_figures import choose_axes
 
         choose_axes(vary, options.samples, len(options.problems))
     # Here `samples` are points, not rows of a trajectory.
@@ -972,7 +972,7 @@ def _sweep(options: argparse.Namespace) -> int:
         progress=show_progress(),
     )
     write_text(output, result.to_csv())
-    save_figure(options.figure, "design.figures:draw_sweep", result)
+    save_figure(options.figure, "figures.result_figures:draw_sweep", result)
     return finish(options, result, output, options.figure)
 
 
@@ -991,7 +991,7 @@ def _sensitivities(options: argparse.Namespace) -> int:
         show_progress(),
         not options.differences,
     )
-    save_figure(options.output, "design.figures:draw_sensitivities", result)
+    save_figure(options.output, "figures.result_figures:draw_sensitivities", result)
     return finish(options, result, options.output, notes=notes)
 
 
@@ -1011,7 +1011,7 @@ def _design(options: argparse.Namespace) -> int:
     )
     for plan, path in zip(result.plans, outputs, strict=True):
         wholearm.save(plan.problem, path)
-    save_figure(options.figure, "design.figures:draw_search", result)
+    save_figure(options.figure, "figures.result_figures:draw_search", result)
     return finish(options, result, *outputs, options.figure)
 
 

@@ -274,8 +274,8 @@ def _find(item: Any, name: str) -> Any:
 
 def show(value: Any, form: str, scale: float = 1.0) -> str:
     """A value as text, a number in a format and times a scale; a dash where there is none."""
-    if isinstance(value, str):
-        return value
+    if isinstance(value, str | bool):
+        return str(value).lower() if isinstance(value, bool) else value
     if isinstance(value, tuple | list | np.ndarray):
         return " ".join(show(entry, form, scale) for entry in value)
     if value is None or math.isnan(value):

@@ -24,7 +24,7 @@ import numpy as np
 
 from .. import __version__
 from ..analysis.robustness import draw_cube
-from ..common.document import Document, Result, Table, format_csv, plain
+from ..common.document import Document, Result, Table, format_csv, plain, show
 from ..common.errors import InfeasibleError, InputError, WholearmError, require_number
 from ..common.fields import Range, choice
 from ..common.journal import Journal
@@ -184,13 +184,12 @@ class Sweep(Result):
         rows, reasons, best = list[list[Any]](), self.reasons, self.best
         for row in self.rows:
             cells: Row = {"phases": [row[key] for key in row if key.startswith("duration")] or None}
-            cells |= {k: show_value(v) for k, v in row.items() if isinstance(v, bool)}
             if "limit" in row:
                 cells["reason"] = f"{row['limit']} ({100 * row['share']:.0f} % of the time)"
             rows.append([(row | cells).get(key) for key in columns])
         last = f"no point has a plan, most often because of: {next(iter(reasons), '')}"
         if best is not None:
-            place = ", ".join(f"{name} = {show_value(self.rows[best][name])}" for name in names)
+            place = ", ".join(f"{name} = {show(self.rows[best][name], '.6g')}" for name in names)
             last = f"best: {self.label} = {self.rows[best]['value']:.6g}, {place}"
         table = Table([*columns.values()], rows, most=100)
         causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
@@ -201,12 +200,6 @@ class Sweep(Result):
         """All rows as CSV, with all digits."""
         keys = (key for row in sorted(self.rows, key=len)[::-1] for key in row)
         return format_csv(self.rows, dict.fromkeys(keys))
-
-
-def show_value(value: Any) -> str:
-    """A number with six digits, or a word."""
-    text = f"{value:.6g}" if isinstance(value, float) else str(value)
-    return text.lower() if isinstance(value, bool) else text
 
 
 def read_vary(

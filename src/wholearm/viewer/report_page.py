@@ -58,8 +58,8 @@ def build_report(
         parts += _describe(contender, 8000 // len(comparison.contenders))
     first = next(filter(None, (contender.planned for contender in comparison.contenders)), None)
     if sensitivities:
-        from ..design.figures import draw_sensitivities
         from ..design.sensitivities import find_sensitivities
+        from ..figures.result_figures import draw_sensitivities
 
         result = find_sensitivities(comparison.contenders[0].problem or problem, progress=progress)
         parts += ["<h2>What 1 % more of each number is worth</h2>"]

@@ -1,0 +1,441 @@
+"""Figures of results: comparisons, predictions, studies of robustness, sweeps, searches.
+
+A sweep is a curve over one parameter, contours over two, small multiples beyond. Points without a
+plan have the colour of their reason. Nothing is interpolated but contour lines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from ..common.arrays import Array
+from ..common.document import show
+from ..common.errors import InputError
+from ..common.sharing import exclusive
+from ..planning.options import Objective
+from . import style
+from .plots import draw_margins, draw_phases
+from .snapshots import place_vertices, trace_link
+
+if TYPE_CHECKING:
+    from ..analysis.comparison import Comparison
+    from ..analysis.robustness import Robustness
+    from ..analysis.slow_speeds import PhasePrediction, Prediction
+    from ..design.hand import Design
+    from ..design.sensitivities import Sensitivities
+    from ..design.sweep import Sweep
+
+MOST = 24  # panels, and lines of a panel
+SHARE = 0.08  # of the points of a panel, from which their reason is written there
+Row = dict[str, Any]  # of a sweep
+Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
+_DOT = "  \u00b7  "  # between the parts of a title
+_KINDS = (
+    ("contacts kept too", style.PALETTE[2], "o"),
+    ("goal reached", style.PALETTE[0], "s"),
+    ("goal missed", style.PALETTE[6], "x"),
+)
+"""What becomes of a sample, its colour and its mark."""
+
+
+@exclusive
+def draw_comparison(comparison: Comparison) -> Figure:
+    """Draw c_n - epsilon of every contact over time: a panel for each plan, on one scale of time.
+
+    Replays are drawn; where nothing has moved a panel says so.
+    """
+    shown = [(contender, contender.replayed) for contender in comparison.contenders]
+    motions = [motion for _, motion in shown if motion is not None]
+    names = dict.fromkeys(name for motion in motions for name in motion.contacts)
+    styles = style.choose_styles(tuple(names))
+    longest = max((motion.duration for motion in motions), default=1.0)
+    # Height of a panel, and of a line of text above it, and room at both sides [in].
+    tall, line, left, right = 2.45, 0.25, 0.8, 1.3
+    high = 0.5 + len(motions) * (tall + line + 0.4) + len(shown) * line
+    covered = np.concatenate([[0.0], *(m.c_n.ravel() - comparison.epsilon for m in motions)])
+    with style.open_figure(10.0, high) as figure:
+        title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
+        style.write_title(figure, title)
+        look: Any = {"fontsize": 9, "color": style.INK, "parse_math": False, "va": "bottom"}
+        look["transform"] = figure.dpi_scale_trans
+        high -= 0.35
+        for contender, motion in shown:
+            high -= line
+            what = f"{contender.duration:.4g} s" if contender.ok else contender.reason
+            between = _DOT if contender.ok else ": "
+            heading = f"{contender.name}{_DOT}{contender.verdict}{between}{what}"
+            figure.text(left, high, heading, **look)
+            if motion is None:
+                continue
+            high -= tall + line
+            axes = style.inset(figure, left, high, 10.0 - left - right, tall)
+            high -= 0.4
+            draw_margins(axes, motion, comparison.epsilon, styles, covered)
+            axes.set_xlim(0.0, longest)
+            draw_phases(axes, motion.phase_starts, span=longest)
+            style.list_contacts(axes, 72 * tall)
+            axes.set_ylabel(f"$c_n - \\varepsilon$ {style.unit_of(axes)}")
+            axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
+    return figure
+
+
+@exclusive
+def draw_prediction(prediction: Prediction) -> Figure:
+    """Draw the least normal force over speed: a panel for each phase, a line for each motion."""
+    phases = [phase for phase in prediction.phases if phase.curves is not None]
+    columns = min(3, max(len(phases), 2))
+    rows = max(math.ceil(len(phases) / columns), 1)
+    # Size of a panel with what is written about it, and the room that this takes [in].
+    (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
+    with style.open_figure(columns * wide, rows * tall + 0.45) as figure:
+        for k, phase in enumerate(phases):
+            row, column = divmod(k, columns)
+            corner = column * wide + left, (rows - 1 - row) * tall + bottom
+            axes = style.inset(figure, *corner, wide - left - right, tall - bottom - top)
+            _draw_phase(axes, phase, prediction.epsilon)
+            axes.set_ylabel("least $c_n$ [N]" if column == 0 else "")
+            axes.set_xlabel("speed along the phase [m/s]" if k >= len(phases) - columns else "")
+        name = f"{prediction.name}{_DOT}quasistatic motions at speed"
+        style.write_title(figure, f"{name}{_DOT}\u03b5 = {prediction.epsilon:g} N", left=0.15)
+    return figure
+
+
+def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
+    """The lines of one phase, with where they break, and above them what breaks."""
+    curves = phase.curves
+    assert curves is not None
+    rest = max([epsilon, *(float(force[0]) for force in curves.force.values())])
+    low, high = -0.35 * rest, 2.2 * rest
+    axes.axhspan(0.0, epsilon, color=style.LOW, linewidth=0, zorder=1)
+    axes.axhspan(low, 0.0, color=style.LOST, linewidth=0, zorder=1)
+    axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
+    above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom", "fontsize": 7.5}
+    for k, survival in enumerate(phase.survivals):
+        colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
+        look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
+        force = curves.force[survival.motion]
+        axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
+        if survival.speed:
+            axes.plot(survival.speed, epsilon, "o", color=colour, markersize=5, zorder=6)
+        again = "never" if survival.again is None else f"only from {survival.again:.3g} m/s on"
+        speed = f"{survival.speed:.3g} m/s" if survival.speed else again
+        failure = f"{speed}: {survival.first.name}"
+        failure = "keeps \u03b5 at any speed" if survival.speed is None else failure
+        text = f"{survival.motion}, {failure}"
+        style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **above)
+    if not any(np.isfinite(force).any() for force in curves.force.values()):
+        middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
+        axes.text(0.5, 0.8, "no slow motion keeps its limits", color=style.INK, **middle)
+    title = f"phase {phase.number}, until {phase.until}"
+    above |= {"fontsize": 9, "fontweight": "bold"}
+    style.write(axes, title, (0, 1), (0, 41), color=style.INK, **above)
+    axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
+    wide = curves.speed[-1] > 20.0 * curves.speed[0]
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if wide else (1.0, 2.0, 3.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.grid(color=style.GRID, linewidth=0.4)
+
+
+@exclusive
+def draw_robustness(study: Robustness) -> Figure:
+    """Draw paths and ends of the samples beside the nominal motion.
+
+    Axes are in the order: hand and paths of the centroid, to scale; distances and angles from the
+    goal.
+    """
+    with style.open_figure(10.0, 4.6, layout="constrained") as figure:
+        motion, ends = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+        _draw_motion(motion, study)
+        _draw_ends(ends, study)
+    return figure
+
+
+def find_kind(record: dict[str, Any]) -> int:
+    """Index of what has become of a sample: kept, reached, missed."""
+    return 0 if record["reached"] and record["kept"] else 1 if record["reached"] else 2
+
+
+def _draw_motion(axes: Axes, study: Robustness) -> None:
+    scene, nominal = study.trial.problem.scene, np.array(study.nominal["path"])
+    axes.set_aspect("equal", adjustable="box")
+    for finger, angle, (line, face) in zip(
+        scene.fingers, nominal[-1, 3:], style.FINGERS, strict=True
+    ):
+        outline = 1e3 * trace_link(finger, float(angle))
+        axes.add_patch(Polygon(outline, fc=face, ec=line, linewidth=0.9, zorder=1))
+    copies = [record for record in study.records if "path" in record]
+    for record in sorted(copies, key=find_kind):
+        path = np.array(record["path"])
+        colour = _KINDS[find_kind(record)][1]
+        axes.plot(*(1e3 * path[:, :2].T), color=colour, linewidth=0.6, alpha=0.5, zorder=3)
+        body = Polygon(1e3 * place_vertices(scene, path[-1]), fill=False, ec=colour)
+        axes.add_patch(body).set(linewidth=0.5, alpha=0.35, zorder=2)
+    for z, dash in ((nominal[0], (0, (4, 2))), (nominal[-1], "-")):
+        body = Polygon(1e3 * place_vertices(scene, z), fill=False, ec=style.INK, linestyle=dash)
+        axes.add_patch(body).set(linewidth=1.2, zorder=5)
+    axes.plot(*(1e3 * nominal[:, :2].T), color=style.INK, linewidth=1.6, zorder=4)
+    axes.autoscale_view()
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    deep = 1e3 * style.PALM * scene.scales.length
+    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=style.INK, lw=0, zorder=1))
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
+
+
+def _draw_ends(axes: Axes, study: Robustness) -> None:
+    records = [record for record in study.records if "distance" in record]
+    uncertainty = study.trial.uncertainty
+    goal = (
+        1e3 * uncertainty.find_distance(study.trial.problem.scene),
+        math.degrees(uncertainty.angle),
+    )
+    deviations = [(1e3 * record["distance"], math.degrees(record["angle"])) for record in records]
+    least = 1e-4  # [mm] and [deg]: lesser ones are drawn so
+    places = np.maximum(np.array(deviations).reshape(-1, 2), least)
+    kinds = np.array([find_kind(record) for record in records])
+    for kind, (label, colour, marker) in enumerate(_KINDS):
+        points = places[kinds == kind]
+        text = f"{label}: {len(points)}"
+        axes.plot(*points.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
+    axes.set(xscale="log", yscale="log")
+    around = np.vstack([places, goal])
+    # Whole powers of ten, so that both ends of an axis have a number.
+    low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
+    high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    notes = [f" (at least {least:g})" * (min(column) <= least) for column in around.T.tolist()]
+    axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
+    axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
+    axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.axhline(goal[1], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
+    beyond = len(study.records) - len(records)
+    title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
+    axes.set_title(title, fontsize=9)
+
+
+def choose_axes(
+    vary: Mapping[str, Sequence[Any]], samples: int, problems: int
+) -> tuple[list[str], list[str]]:
+    """Names of the parameters that are axes, and of those that lines or panels are for.
+
+    InputError if a grid has more than three parameters, or there are too many panels.
+    """
+    several = [name for name, values in vary.items() if len(values) > 1]
+    numeric = [k for k in several if all(type(v) in (int, float) for v in vary[k])]
+    if not numeric or (len(numeric) > 3 and not samples):
+        text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
+        raise InputError("", "--figure", f"{text}; --samples may have any number")
+    shown = numeric if samples else numeric[:2]
+    fixed = [] if samples else [name for name in several if name not in shown]
+    if max(len(shown), problems * math.prod(len(vary[name]) for name in fixed)) > MOST:
+        raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
+    return shown, fixed
+
+
+def draw_sweep(sweep: Sweep) -> Figure:
+    """Draw the values over the parameters, and why there are none where there are none.
+
+    Over one parameter, problems and words are lines; over two they are panels. Samples have a panel
+    for each parameter.
+
+    InputError as `choose_axes`.
+    """
+    shown, fixed = choose_axes(sweep.vary, sweep.samples, len(sweep.problems))
+    lines = dict[str, list[Row]]()
+    for row in sweep.rows:
+        parts = [row["problem"]] if len(sweep.problems) > 1 else []
+        parts += [f"{name} = {show(row[name], '.6g')}" for name in fixed]
+        lines.setdefault(", ".join(parts), []).append(row)
+    contours = len(shown) == 2 and not sweep.samples
+    panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
+    reasons = sweep.reasons
+    colours = {reason: style.PALETTE[k % len(style.PALETTE)] for k, reason in enumerate(reasons)}
+    columns = 2 if len(panels) == 4 else min(3, len(panels))
+    height = 1.2 + 3.0 * math.ceil(len(panels) / columns) + 0.17 * min(len(reasons), 8)
+    with style.open_figure(10.0 if columns > 1 else 7.0, height, layout="constrained") as figure:
+        grid = figure.subplots(math.ceil(len(panels) / columns), columns, squeeze=False)
+        for k, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
+            if contours:
+                ((title, rows),) = panel.items()
+                axes.set_title(title, fontsize=9, parse_math=False)
+                mesh = _draw_plane(axes, sweep, shown, rows, colours)
+            else:
+                _draw_lines(axes, sweep, shown[k], panel, colours)
+        for axes in grid.flat[len(panels) :]:
+            axes.remove()
+        if contours:
+            figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), label=sweep.label)
+        patches = [
+            Patch(color=_pale(colours[reason]), label=fill(f"{reason}: {count}", 110))
+            for reason, count in [*reasons.items()][:8]
+        ]
+        if patches:
+            look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
+            figure.legend(handles=patches, title="points without a plan, by reason", **look)
+        figure.suptitle(", ".join(sweep.problems), fontsize=10, parse_math=False)
+    return figure
+
+
+def _pale(colour: str) -> tuple[float, float, float]:
+    red, green, blue = (0.7 + 0.3 * int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue
+
+
+def _take(rows: Sequence[Row]) -> tuple[Array, list[str]]:
+    """Values of rows, NaN without a plan, and reasons, empty with a plan."""
+    values = np.array([row["value"] for row in rows], dtype=float)
+    return values, [row.get("reason", "") for row in rows]
+
+
+def _border(places: Array) -> Array:
+    """Borders of cells around places, half way between them."""
+    return np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
+
+
+def _write(axes: Axes, reason: str, colour: str, x: float, y: float, transform: Any) -> None:
+    box = {"facecolor": _pale(colour), "linewidth": 0, "pad": 1.5}
+    look: Any = {"ha": "center", "va": "center", "fontsize": 7.5, "color": style.INK, "bbox": box}
+    text = fill(reason if len(reason) <= 60 else f"{reason[:57]}...", 18)
+    axes.text(x, y, text, transform=transform, parse_math=False, **look)
+
+
+def _draw_lines(
+    axes: Axes, sweep: Sweep, name: str, lines: Lines, colours: Mapping[str, str]
+) -> None:
+    """Values over one parameter.
+
+    Where a curve alone has no value, there is a band in the colour of the reason. Several lines,
+    and samples, have a row of crosses each at the bottom.
+    """
+    axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
+    axes.grid(color=style.GRID, linewidth=0.4)
+    single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
+    for number, (label, rows) in enumerate(lines.items()):
+        rows = sorted(rows, key=lambda row: row[name])
+        x = np.array([row[name] for row in rows], dtype=float)
+        (values, reasons), (dash, marker) = _take(rows), style.LINES[number % len(style.LINES)]
+        look: Any = {"color": style.PALETTE[number % len(style.PALETTE)], "marker": marker, "ms": 3}
+        axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
+        strip, borders, first = 0.05 * number + 0.025, _border(x), 0
+        if len(lines) > 1 and any(reasons):
+            axes.plot(0.0, strip, transform=axes.transAxes, clip_on=False, **look)
+        for reason, group in groupby(reasons):
+            last = first + len(list(group))
+            left, right, colour = borders[first], borders[last], colours.get(reason, "")
+            if reason and single:
+                axes.axvspan(left, right, color=_pale(colour), linewidth=0, zorder=1)
+                if last - first > SHARE * len(rows):
+                    _write(axes, reason, colour, (left + right) / 2, 0.5, across)
+            elif reason:
+                places = np.full(last - first, strip)
+                axes.plot(x[first:last], places, "x", color=colour, transform=across)
+            first = last
+    if not single:
+        bottom, top = axes.get_ylim()
+        axes.set_ylim(top - (top - bottom) / (1 - 0.05 * len(lines)), top)
+    if len(lines) > 1:
+        axes.legend(fontsize=8)
+
+
+def _draw_plane(
+    axes: Axes, sweep: Sweep, shown: Sequence[str], rows: Sequence[Row], colours: Mapping[str, str]
+) -> Any:
+    """Values over two parameters as cells, with contour lines, and regions without a plan."""
+    axes.set(xlabel=sweep.titles[shown[0]], ylabel=sweep.titles[shown[1]])
+    x, y = (np.sort(np.array(sweep.vary[name], dtype=float)) for name in shown)
+    values, reasons = _take(sorted(rows, key=lambda row: [row[name] for name in shown]))
+    values, every = values.reshape(len(x), len(y)).T, _take(sweep.rows)[0]
+    low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
+    look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
+    mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
+    if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
+        levels = MaxNLocator(8).tick_values(low, high)
+        shown_values = np.ma.masked_invalid(values)
+        lines = axes.contour(x, y, shown_values, levels, colors="white", linewidths=0.9)
+        axes.clabel(lines, fontsize=7.5)
+    shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
+    for reason, colour in colours.items():
+        here = names == reason
+        shades[here] = *_pale(colour), 1.0
+        if here.mean() > SHARE and here.any(axis=0).mean() > 0.35:  # wide enough
+            below, left = np.nonzero(here)
+            _write(axes, reason, colour, x[left].mean(), y[below].mean(), axes.transData)
+    axes.pcolormesh(_border(x), _border(y), shades)
+    return mesh
+
+
+@exclusive
+def draw_sensitivities(result: Sensitivities) -> Figure:
+    """Draw what 1 % more of each number changes, part by part of the plan, the largest first."""
+    rows = [row for row in result.rows if row.percent]
+    titles, count = [f"{row.name} = {row.given:.4g} {row.unit}" for row in rows], range(len(rows))
+    high, left = 0.24 * len(rows), 0.4 + 0.075 * max(map(len, titles), default=0)
+    with style.open_figure(style.WIDTH, high + 1.1) as figure:
+        axes = style.inset(figure, left, 0.6, style.WIDTH - left - 2.2, high)
+        worth = 0.01 * np.array([[row.given * slope for slope in row.phases] for row in rows])
+        for k, (part, bars) in enumerate(zip(result.parts, worth.T, strict=True)):
+            before = np.where(worth[:, :k] * bars[:, None] > 0, worth[:, :k], 0.0).sum(axis=1)
+            colour = style.PALETTE[k % len(style.PALETTE)]
+            axes.barh(count, bars, 0.7, before, color=colour, label=f"phase {part}")
+        axes.barh(count, 0.0, 0.84, [row.percent for row in rows], edgecolor=style.INK, lw=1.6)
+        for k, row in enumerate(rows):
+            text = row.limit + " (one-sided)" * bool(row.note)
+            axes.text(1.02, k, text, transform=axes.get_yaxis_transform(), va="center", fontsize=8)
+        axes.axvline(0.0, color=style.INK, linewidth=0.8)
+        axes.set_yticks(count, titles)
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlabel(f"1 % more changes the {result.objective} [{result.unit}]; line: in all")
+        axes.legend(loc="lower right", fontsize=8)
+        style.write_title(figure, result.document.head)
+        return figure
+
+
+@exclusive
+def draw_search(result: Design) -> Figure:
+    """Draw what is minimised and the numbers of all hands tried, with lines for the best so far."""
+    choices, wide = result.aim.choices, style.WIDTH - 3.4
+    with style.open_figure(style.WIDTH, 3.1 + len(choices)) as figure:
+        tall = float(figure.get_size_inches()[1])
+        first = style.inset(figure, 1.2, tall - 2.4, wide, 2.0)
+        others = [style.inset(figure, 1.2, tall - 3.4 - k, wide, 0.8) for k in range(len(choices))]
+        starts = sorted({hand.start for hand in result.hands})
+        for start, colour in zip(starts, style.PALETTE * len(starts), strict=False):
+            hands = [hand for hand in result.hands if hand.start == start]
+            costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
+            best, none = np.fmin.accumulate(costs), number[np.isnan(costs)]
+            leads, values = costs <= best, np.array([result.aim.find(hand) for hand in hands])
+            first.step(number, best, where="post", color=colour, label=f"start {start}")
+            for axes, column in zip([first, *others], [costs, *values.T], strict=True):
+                shown = ~np.isnan(costs)
+                axes.plot(number[shown], column[shown], ".", color=colour, alpha=0.4)
+                axes.step(number[leads], column[leads], where="post", color=colour)
+            across = first.get_xaxis_transform()
+            first.plot(none, 0 * none + 0.03, "x", color=colour, transform=across)
+        good = [hand.cost for hand in result.hands if not hand.reason]
+        first.set_ylim(min(good) - 0.1 * np.ptp(good) - 1e-9, np.quantile(good, 0.95))
+        first.set_ylabel(result.label)
+        first.legend(bbox_to_anchor=(1.01, 1.0), loc="upper left")
+        for axes, choice in zip(others, choices, strict=True):
+            room = 0.05 * (choice.high - choice.low)
+            axes.set_ylim(choice.low - room, choice.high + room)
+            title = choice.parameter.title
+            axes.text(1.02, 0.5, title, transform=axes.transAxes, va="center")
+        for axes in (first, *others):
+            axes.sharex(others[-1])
+            axes.tick_params(labelbottom=axes is others[-1])
+        others[-1].set_xlabel("hands tried; x: no plan")
+        style.write_title(figure, ", ".join(plan.headline for plan in result.plans))
+        return figure
