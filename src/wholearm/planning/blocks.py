@@ -539,6 +539,9 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     from .dwell import Junction, add_pause, choose_junction
 
     epsilon, parts = planning.problem.epsilon, sequence.split()
+    # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
+    more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
+    first_epsilon, last_epsilon = (epsilon + max(other - more[1], 0.0) for other in more[::2])
     block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
     if block_before is not None:
@@ -553,10 +556,11 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     for part, after in zip(parts, firsts, strict=True):
         number, first, last = part.phases[0].number, part.curves[0], part.curves[-1]
         if before is not None and junction is None:
-            junction = choose_junction(before, first, first.start, epsilon, number)
+            junction = choose_junction(before, first, first.start, first_epsilon, number)
         coming = None
         if after is not None:
-            coming = choose_junction(last, after, last.end, epsilon, part.phases[-1].number + 1)
+            least = last_epsilon if part is parts[-1] else epsilon
+            coming = choose_junction(last, after, last.end, least, part.phases[-1].number + 1)
         pins = junction.begins if junction else None, coming.ends if coming else None
         duration = planning.allow(part.phases)
         if duration is not None and junction is not None:

@@ -128,9 +128,14 @@ def _improve(
     """
     index, others = planning.find_block(number), list[Planning]()
     block = planning.blocks[index]
-    coarse = replace(block, coarse=True)
+    # Torques where blocks meet depend on both where they may not step.
+    reach = 1 if planning.problem.scene.has_slow_motors else 0
+    near = range(index - reach, index + reach + 1)
     again = replace(
-        planning, blocks=(*planning.blocks[:index], coarse, *planning.blocks[index + 1 :])
+        planning,
+        blocks=tuple(
+            replace(b, coarse=b.coarse or k in near) for k, b in enumerate(planning.blocks)
+        ),
     )
     if planning.allowed:
         least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
