@@ -530,7 +530,7 @@ class Replay(Run):
             return False
         if coming + 1 >= len(self.breaks) or self.steps_at[coming]:
             return False
-        late = 2 * self._time_to_stop() > self.rest_window
+        late = 2 * self._time_to_stop() > self.settling  # phase 4 of query 47: 9e-5 s
         # Above the error of integration.
         return late and self._measure_rate() < -1e-7
 
