@@ -265,22 +265,12 @@ class Fastest(NamedTuple):
 
     s: Array  # (N + 1,) [m]
     b: Array  # (N + 1,) [m^2/s^2]
-    modes: NDArray[np.int64]  # (N,): `SweepMode` in each interval
     switches: list[Switch]
 
     @property
-    def slopes(self) -> Array:
-        """The s'' of each interval, shape (N,) [m/s^2]."""
-        return np.asarray(np.diff(self.b) / (2 * np.diff(self.s)))
-
-    def find_modes(self, places: Array) -> NDArray[np.int64]:
-        """Modes at some places [m]: never `SWITCH`."""
-        modes = self.modes[np.clip(np.searchsorted(self.s, places) - 1, 0, len(self.modes) - 1)]
-        jumps = np.array([place for place, jumps in self.switches if jumps])
-        for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
-            jump = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
-            modes[k] = SweepMode.PUSH if places[k] < jump else SweepMode.BRAKE
-        return modes
+    def slopes(self) -> tuple[Array, Array]:
+        """Middles of the intervals [m] and the s'' of each, shape (N,) [m/s^2]."""
+        return (self.s[1:] + self.s[:-1]) / 2, np.diff(self.b) / (2 * np.diff(self.s))
 
 
 def find_fastest(data: PhaseData) -> Fastest | None:
@@ -307,7 +297,7 @@ def find_fastest(data: PhaseData) -> Fastest | None:
     before = (b[:-1] - 2 * pushed * s[:-1])[index] + 2 * pushed[index] * places
     after = (b[1:] - 2 * braked * s[1:])[index] + 2 * braked[index] * places
     here = np.where(switched, np.where(late, after, before), here)
-    return Fastest(s, b, modes, samples.find_switches(here, share, index))
+    return Fastest(s, b, samples.find_switches(here, share, index))
 
 
 def equidistribute(part: PhaseData, motion: PathMotion, costs: Array, elements: int) -> Array:

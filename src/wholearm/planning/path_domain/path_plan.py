@@ -49,10 +49,10 @@ from .path_nlp import (
     build_path_nlp,
     center,
     guess,
+    guess_below,
     make_bounds,
     pack,
     parameters,
-    start_at,
     unpack,
 )
 
@@ -373,8 +373,7 @@ class PathIterate:
             breaks.append(curve_breaks[:0] if few else curve_breaks)
         parts = task.lay_out(breaks, elements)
         first = PathIterate.on(task, (breaks, none), parts, units)
-        profile, multipliers = start_at(first.nlp, first.data, units, fastest)
-        return replace(first, solution=PathSolution(profile, 0.0, multipliers))
+        return first.start(guess_below(first.data, fastest), 0.0)
 
     @staticmethod
     def on(
