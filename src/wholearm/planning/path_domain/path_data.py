@@ -223,14 +223,13 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         columns = zip(*forces, strict=True)
         return Places(PathForces(*map(np.concatenate, columns)), *map(np.concatenate, tables))
 
-    bends = [part.grid.bends for part in parts if part.grid.bends is not None]
     return parts[0]._replace(
         grid=Grid(
             chain((part.grid.s for part in parts), starts),
             chain((part.grid.segment for part in parts), segments),
             (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
             parts[0].grid.held,
-            np.concatenate(bends) if bends else None,
+            np.concatenate([part.grid.bends for part in parts]),
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),

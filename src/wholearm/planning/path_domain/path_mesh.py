@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
-from ...mechanics.path_limits import PathLimits
+from ...mechanics.path_limits import Extreme, PathLimits
 from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
 from .path_data import PhaseData, find_torques
 from .path_motion import DEGREE, NODES, Grid, PathMotion, Profile, lay_out
@@ -130,11 +130,11 @@ def find_switches(data: PhaseData, profile: Profile, margin: float) -> list[Swit
     """
     samples = LimitSamples.of(data, margin)
     here = data.interpolate(profile, samples.fractions)
-    high, low = (samples.rows.extreme(here.b, largest).a for largest in (True, False))
+    high, low = samples.find_extremes(here.b)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = (high - here.a) / (high - low)
+        share = (high.a - here.a) / (high.a - low.a)
     element = np.arange(len(here.b)) // (len(samples.fractions) * DEGREE)
-    return samples.find_switches(here.b, share, element)
+    return samples.find_switches(here.b, share, element, high, low)
 
 
 class LimitSamples(NamedTuple):
@@ -159,16 +159,24 @@ class LimitSamples(NamedTuple):
         segment, length = np.repeat(data.grid.segment[k], len(picked)), float(data.grid.s[-1])
         return LimitSamples(fractions[picked], s, sides, sides.eliminate(), segment, length)
 
-    def find_switches(self, b: Array, share: Array, element: NDArray[np.int64]) -> list[Switch]:
-        """Switches of a motion; see `_Looks` for its arguments."""
-        high, low = (self.rows.extreme(b, largest) for largest in (True, False))
+    def find_extremes(self, b: Array) -> tuple[Extreme, Extreme]:
+        """The largest and the least s'' for b of shape (n,)."""
+        return self.rows.extreme(b, True), self.rows.extreme(b, False)
+
+    def find_switches(
+        self, b: Array, share: Array, element: NDArray[np.int64], high: Extreme, low: Extreme
+    ) -> list[Switch]:
+        """Switches of a motion with these extremes of s''; see `_Looks` for the rest."""
         span, switches = high.a - low.a, list[Switch]()
         choice = np.isfinite(span) & (span > 1e-3 * np.abs(high.a))  # else there is no choice
+        row = np.where(share < 0.5, high.row, low.row)
+        label = np.where(share < 0.5, row, -1 - row)
+        label[b > (1 - 1e-3) * self.rows.cap] = _CAPPED  # active
         # Across a reversal limits are others, and an element ends there anyway.
         for segment in sorted(set(self.segment.tolist())):
             k = np.flatnonzero(choice & (self.segment == segment))
-            limits = self.sides.pick(k), self.rows.pick(k), high.row[k], low.row[k]
-            looks = _Looks(self.s[k], b[k], *limits, share[k], element[k])
+            motion = self.s[k], b[k], share[k], element[k], row[k], label[k]
+            looks = _Looks(*motion, self.sides.pick(k), self.rows.pick(k))
             switches += looks.find_switches(4e-3 * self.length)  # nearer ones are one change
         return switches
 
@@ -178,23 +186,17 @@ class _Looks(NamedTuple):
 
     s: Array  # [m]
     b: Array  # [m^2/s^2]: of the motion there
-    sides: PathLimits
-    rows: PathLimits
-    at_high: NDArray[np.int64]  # at_high, at_low: rows that set the largest and the least s''
-    at_low: NDArray[np.int64]
     share: Array  # distance of s'' from its largest, over the range that limits allow
     element: NDArray[np.int64]  # that each place belongs to
+    row: NDArray[np.int64]  # that sets the nearer one of the largest and the least s''
+    label: NDArray[np.int64]  # the row, negative for the least s''; `_CAPPED` for a speed limit
+    sides: PathLimits
+    rows: PathLimits
 
     @property
     def rises(self) -> NDArray[np.bool_]:
         """Whether s'' is nearer to its largest than to its least."""
         return np.asarray(self.share < 0.5)
-
-    @property
-    def label(self) -> NDArray[np.int64]:
-        """The active or nearest row; negative for the least s'', `_CAPPED` for a speed limit."""
-        row = np.where(self.rises, self.at_high, -1 - self.at_low)
-        return np.where(self.b > (1 - 1e-3) * self.rows.cap, _CAPPED, row)  # active
 
     def find_switches(self, flicker: float) -> list[Switch]:
         """Switches of rows; changes nearer to each other than `flicker` [m] are one."""
@@ -216,10 +218,9 @@ class _Looks(NamedTuple):
     def find_crossing(self, first: int, last: int) -> float:
         """Where another vertex takes over as that of the extreme s'', between two places [m]."""
         ends = np.array([first, last])
-        active = (self.at_high if self.rises[first] else self.at_low)[ends]
         sides = self.sides.pick(ends)
         # A pair of sides that bounds s'' here may not do so there, but they meet somewhere.
-        before, after = (sides.meet(self.b[ends], sides.pair(row))[0] for row in active)
+        before, after = (sides.meet(self.b[ends], sides.pair(row))[0] for row in self.row[ends])
         lead = before - after
         done = lead[0] / (lead[0] - lead[1]) if lead[0] * lead[1] < 0 else 0.5
         return float(self.s[first] + done * (self.s[last] - self.s[first]))
@@ -297,7 +298,8 @@ def find_fastest(data: PhaseData) -> Fastest | None:
     before = (b[:-1] - 2 * pushed * s[:-1])[index] + 2 * pushed[index] * places
     after = (b[1:] - 2 * braked * s[1:])[index] + 2 * braked[index] * places
     here = np.where(switched, np.where(late, after, before), here)
-    return Fastest(s, b, samples.find_switches(here, share, index))
+    switches = samples.find_switches(here, share, index, *samples.find_extremes(here))
+    return Fastest(s, b, switches)
 
 
 def equidistribute(part: PhaseData, motion: PathMotion, costs: Array, elements: int) -> Array:

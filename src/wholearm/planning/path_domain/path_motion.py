@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -52,10 +52,9 @@ def find_basis() -> Basis:
     y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(DEGREE + 1)
     to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
-    plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
-    rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
-    cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
-    rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
+    totals = powers + POWERS[:, None]
+    rises = np.diff(y[..., None] ** totals[:, None], axis=1) / totals[:, None]
+    rises *= 2 * (SIGNS * POWERS)[:, None, None]
     weights = (1 / (powers + 1)) @ to_powers[0]
     modes = np.asarray(np.linalg.inv(legendre.legvander(2 * x - 1, DEGREE)), dtype=float)
     return Basis(y, to_powers, rises @ to_powers, weights, modes)
@@ -66,9 +65,9 @@ class Grid(NamedTuple):
 
     s: Array  # (N + 1,) [m]: element by element, equal where two elements meet
     segment: NDArray[np.int64]  # (N + 1,): of the curve, for each node's forces
-    rests: tuple[bool, bool] = (True, True)  # whether the motion starts and ends at rest
-    held: bool = False  # whether it does so without acceleration
-    bends: Array | None = None  # (E,): c of the elements of the kind `INSIDE`; None for zeros
+    rests: tuple[bool, bool]  # whether the motion starts and ends at rest
+    held: bool  # whether it does so without acceleration
+    bends: Array  # (E,): c of the elements, zero but for the kind `INSIDE` of `held` motions
 
     @property
     def steps(self) -> Array:
@@ -112,14 +111,8 @@ class Grid(NamedTuple):
         # The two ends are no unknowns.
         return np.maximum(sizes, np.finfo(float).tiny)
 
-    def interpolate(self, values: Array, other: Grid) -> Array:
-        """Values at the nodes of another grid of the same curves, linear between those here."""
-        # Of two nodes at one place, each belongs to the side of its element.
-        hair = 1e-9 * (self.s[-1] - self.s[0])
-        return np.interp(other._lean(2 * hair), self._lean(hair), values)
-
-    def _lean(self, by: float) -> Array:
-        """The nodes, those at the ends of elements moved inwards a little."""
+    def lean(self, by: float) -> Array:
+        """The nodes, those at the ends of elements moved inwards a little [m]."""
         s = self.s.copy().reshape(-1, NODES)
         s[:, 0] += by
         s[:, -1] -= by
@@ -128,13 +121,9 @@ class Grid(NamedTuple):
     def integrate(self, a: Array) -> Array:
         """B at the nodes for s'' there, from rest, shape (N + 1,)."""
         lengths = np.diff(self.edges)
-        table = a.reshape(-1, NODES, 1)
-        links, kinds = find_basis().links, self.kinds
-        rises = (links[kinds] @ table)[..., 0]
-        if self.bends is not None:
-            bends = (self.bends * (kinds == INSIDE))[:, None]
-            rises += bends * ((links[FROM_REST] - links[INSIDE]) @ table)[..., 0]
-        rises *= lengths
+        table, links = a.reshape(-1, NODES, 1), find_basis().links
+        bent = self.bends[:, None, None] * (links[FROM_REST] - links[INSIDE])
+        rises = lengths * ((links[self.kinds] + bent) @ table)[..., 0]
         return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
 
 
@@ -142,17 +131,16 @@ def lay_out(
     edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool], held: bool = False
 ) -> Grid:
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
-    grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held)
-    kinds, y = grid.kinds[:, None], find_basis().y[grid.kinds]
-    share = y ** POWERS[kinds]
-    share = np.where(SIGNS[kinds] > 0, share, 1 - share)
+    bends = np.zeros(len(edges))
+    grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held, bends)
+    kinds = grid.kinds
     if held:
-        grid = grid._replace(bends=_find_bends(edges, rests))
-        c = np.asarray(grid.bends)[:, None]
-        share = np.where(kinds == INSIDE, (1 - c) * y + c * y**2, share)
+        bends = _find_bends(edges, rests) * (kinds == INSIDE)
+    y, c = find_basis().y[kinds] ** POWERS[kinds, None], bends[:, None]
+    share = np.where(SIGNS[kinds, None] > 0, (1 - c) * y + c * y**2, 1 - y)
     s = edges[:, :1] + share * np.diff(edges)
     s[:, -1] = edges[:, 1]
-    return grid._replace(s=s.ravel())
+    return grid._replace(s=s.ravel(), bends=bends)
 
 
 def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
@@ -192,62 +180,51 @@ class Elements:
     """The polynomials of a profile at the nodes of a grid."""
 
     def __init__(self, grid: Grid, profile: Profile) -> None:
-        self.grid = grid
-        basis, kinds = find_basis(), grid.kinds
-        self._y = basis.y[kinds].ravel()
-        self._rooted, self._power = kinds > 0, POWERS[kinds]
+        self.grid, basis, kinds = grid, find_basis(), grid.kinds
+        self._y, self._power = basis.y[kinds].ravel(), POWERS[kinds]
         table = np.stack([profile.a, profile.lam], axis=-1)
-        table = table.reshape(len(kinds), NODES, 2)
-        self._motion = basis.to_powers[kinds] @ table
-        powers = np.arange(NODES)[:, None]
-        a = np.diff(grid.edges)[:, :, None] * self._motion[..., :1]
-        sign = SIGNS[kinds][:, None, None]
-        first = profile.b.reshape(-1, NODES)[:, :1, None]
-        plain = np.concatenate([first, 2 * a / (powers + 1)], axis=1)
-        rooted = np.concatenate([4 * sign * a / (powers + 2), np.zeros_like(first)], axis=1)
-        # A constant part of s'' in y would be rounding.
-        later = 6 * sign * a[:, 1:] / (powers[:-1] + 4)
-        cubic = np.concatenate([later, np.zeros_like(a[:, :2])], axis=1)
-        rooted = np.where(self._power[:, None, None] == 3, cubic, rooted)
-        b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
-        self._bends = None if grid.bends is None else grid.bends * (kinds == INSIDE)
-        if self._bends is not None:
-            c = self._bends[:, None]
-            further = c * np.hstack([0 * first[..., 0], (4 * a / (powers + 2))[..., 0]])
-            b[:, 1:] *= 1 - c
-            b = np.hstack([b, np.zeros_like(c)])
-            b[:, 1:] += further
-        self._b = b
+        self._motion = basis.to_powers[kinds] @ table.reshape(len(kinds), NODES, 2)
+        a, powers = np.diff(grid.edges) * self._motion[..., 0], np.arange(NODES)
+        # b over y^(2 power - 2); without acceleration at rest the first term would be rounding.
+        power = self._power[:, None]
+        rises = 2 * (power * SIGNS[kinds, None]) * a / (powers + power)
+        first, none = profile.b.reshape(-1, NODES)[:, :1], np.zeros((len(kinds), 1))
+        inside, rooted = np.hstack([first, rises]), np.hstack([rises, none])
+        cubic = np.hstack([rises[:, 1:], none, none])
+        self._b = np.where(power == 1, inside, np.where(power == 2, rooted, cubic))
+        if grid.bends.any():
+            c = grid.bends[:, None]
+            self._b = np.hstack([self._b, none])
+            self._b[:, 1:-1] *= 1 - c
+            self._b[:, 2:] += 4 * c * a / (powers + 2)
 
     @property
     def stretch(self) -> Array:
         """Slope ds/dy at the nodes over the element's length, (E, p + 1)."""
-        y = self._y.reshape(-1, NODES)
-        c = 0.0 if self._bends is None else self._bends[:, None]
-        power = self._power[:, None]
+        y, c, power = self._y.reshape(-1, NODES), self.grid.bends[:, None], self._power[:, None]
         return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
 
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
-        element = k // NODES
-        power = self._power[element]
+        power, c = self._power[k // NODES], self.grid.bends[k // NODES]
         y, later = self._y[k], self._y[k + 1]
-        squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
-        here = np.where(power == 2, squares, left * y + done * later)
-        if self._bends is not None:
-            c = self._bends[element]
-            part = left * ((1 - c) * y + c * y**2) + done * ((1 - c) * later + c * later**2)
-            root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * part, 0.0))
-            bent = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
-            here = np.where(c != 0, bent, here)
-        if self.grid.held:
-            here = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), here)
+        here = left * y + done * later
+        for one in (2, 3):
+            at = power == one
+            part = left[at] * y[at] ** one + done[at] * later[at] ** one
+            here[at] = np.maximum(part, 0.0) ** (1 / one)
+        at = c != 0
+        y, later, c = y[at], later[at], c[at]
+        part = left[at] * ((1 - c) * y + c * y**2) + done[at] * ((1 - c) * later + c * later**2)
+        root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * part, 0.0))
+        here[at] = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
         return here
 
-    def find_cubic(self, k: NDArray[np.int64], w: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Whether s is cubic in y in intervals k, y at a part w of its rise there, and the rise."""
-        y, later = self._y[k], self._y[k + 1]
-        return self._power[k // NODES] == 3, y + w * (later - y), later - y
+    def find_ramps(self, k: NDArray[np.int64]) -> tuple[Any, Array, Array, Array]:
+        """Which of the intervals k are next to rest, the power of y in s, y there and its rise."""
+        rooted = np.flatnonzero(self._power[k // NODES] > 1)
+        k = k[rooted]
+        return rooted, self._power[k // NODES], self._y[k], self._y[k + 1] - self._y[k]
 
     def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
@@ -258,9 +235,10 @@ class Elements:
         b = self._b[element, -1]
         for power in reversed(range(self._b.shape[1] - 1)):
             b = b * y + self._b[element, power]
-        speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
-        if self.grid.held:
-            speed = speed * np.where(self._power[element] == 3, y, 1.0)
+        speed = np.sqrt(np.maximum(b, 0.0))
+        for one in (2, 3):
+            at = self._power[element] >= one
+            speed[at] *= y[at]
         return Profile(motion[0], speed**2, motion[1]), speed
 
     def at(self, fractions: Array) -> Profile:
@@ -272,10 +250,10 @@ class Elements:
     def move(self, grid: Grid) -> Profile:
         """The profile at the nodes of another grid of the same curves."""
         old = self.grid
-        place = old.interpolate(np.arange(len(old.s), dtype=float), grid)
-        k = np.clip(np.floor(place).astype(int), 0, len(old.s) - 2)
-        k = np.where(k % NODES == DEGREE, k + 1, k)
-        k = np.minimum(k, len(old.s) - 2)
+        # Of two nodes at one place, each belongs to the side of its element.
+        hair = 1e-9 * (old.s[-1] - old.s[0])
+        k = np.searchsorted(old.lean(hair), grid.lean(2 * hair), side="right") - 1
+        k = np.minimum(k + (k % NODES == DEGREE), len(old.s) - 2)
         done = np.clip((grid.s - old.s[k]) / np.maximum(old.steps[k], 1e-300), 0.0, 1.0)
         return self.evaluate(k, self.find_y(k, done, 1 - done))[0]
 
@@ -319,24 +297,23 @@ class PathMotion:
 
     @cached_property
     def _slowness(self) -> Array:
-        """Speed at constant s'' over the true one, at Gauss points of each solid interval, (n, m).
+        """Slope of time over w and the mean time, at Gauss points of each solid interval, (n, m).
 
-        Of the variable w from 0 to 1 in which the speed at constant s'' is linear.
+        In the variable w from 0 to 1, amid a motion the speed at constant s'' is linear; next to
+        rest y is.
         """
         k, (v0, v1) = self.grid.nonempty, (speed[:, None] for speed in self._ends)
         w = (1 + _GAUSS) / 2
         done, left = _share(v0, v1, w)
-        every = np.repeat(k, len(w))
-        y = self.elements.find_y(every, done.ravel(), left.ravel())
-        plain = v0 * (1 - w) + v1 * w
-        if self.grid.held:
-            cubic, y_cubic, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
-            y = np.where(cubic, y_cubic, y)
-            length = np.diff(self.grid.edges)[every // NODES, 0]
-            mean = np.repeat(self.grid.steps[k] / np.maximum(v0 + v1, _TINY)[:, 0], len(w))
-            slow = 1.5 * np.abs(rise) * length * y_cubic**2 / mean
-            plain = np.where(cubic.reshape(done.shape), slow.reshape(done.shape), plain)
-        speed = self.elements.evaluate(every, y)[1].reshape(done.shape)
+        every, plain = np.repeat(k, len(w)), v0 * (1 - w) + v1 * w
+        y = self.elements.find_y(every, done.ravel(), left.ravel()).reshape(done.shape)
+        rooted, *ramps = self.elements.find_ramps(k)
+        power, first, rise = (part[:, None] for part in ramps)
+        mean = self.grid.steps[k[rooted], None] / np.maximum(v0 + v1, _TINY)[rooted]
+        length = np.diff(self.grid.edges)[k[rooted] // NODES]
+        y[rooted] = first + w * rise
+        plain[rooted] = power / 2 * np.abs(rise) * length * y[rooted] ** (power - 1) / mean
+        speed = self.elements.evaluate(every, y.ravel())[1].reshape(done.shape)
         return np.asarray(plain / np.maximum(speed, np.maximum(plain / _STALLED, _TINY)))
 
     @property
@@ -357,13 +334,11 @@ class PathMotion:
         v0, v1 = (speed[:, None] for speed in self._ends)
         here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
         w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
-        if self.grid.held:
-            # Where s is cubic in y, w is the part of y's rise.
-            k = np.repeat(self.grid.nonempty, len(fractions))
-            done = np.tile(fractions, len(w))
-            cubic, start, rise = self.elements.find_cubic(k, np.zeros(len(k)))
-            share = np.clip((self.elements.find_y(k, done, 1 - done) - start) / rise, 0.0, 1.0)
-            w = np.where(cubic, share, w.ravel()).reshape(w.shape)
+        rooted, _, first, rise = self.elements.find_ramps(self.grid.nonempty)
+        k = np.repeat(self.grid.nonempty[rooted], len(fractions))
+        done = np.tile(fractions, len(rooted))
+        y = self.elements.find_y(k, done, 1 - done).reshape(len(rooted), len(fractions))
+        w[rooted] = np.clip((y - first[:, None]) / rise[:, None], 0.0, 1.0)
         powers = legendre.legvander(2 * w - 1, _POINTS)
         return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
 
@@ -393,11 +368,10 @@ class PathMotion:
         v0, v1 = (speed[n] for speed in self._ends)
         done, left = _share(v0, v1, w)
         y = self.elements.find_y(k, done, left)
-        if self.grid.held:
-            cubic, y_cubic, rise = self.elements.find_cubic(k, w)
-            start = y_cubic - w * rise
-            part = (y_cubic**3 - start**3) / ((start + rise) ** 3 - start**3)
-            done, y = np.where(cubic, part, done), np.where(cubic, y_cubic, y)
+        rooted, power, first, rise = self.elements.find_ramps(k)
+        y[rooted] = first + w[rooted] * rise
+        whole = (first + rise) ** power - first**power
+        done[rooted] = (y[rooted] ** power - first**power) / whole
         here, _ = self.elements.evaluate(k, y)
         return self.grid.s[k] + done * self.grid.steps[k], self.grid.segment[k], here
 
