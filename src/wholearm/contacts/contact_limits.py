@@ -211,12 +211,13 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     text = f"{contact.corner} touches {contact.part}"
     if contact.finger is None or (touching and contact.surface == "finger"):
         return GapLimit(gap, text, contact)
-    link = build_features(scene).links[contact.finger]
+    features, i = build_features(scene), contact.index
+    link = features.links[contact.finger]
     if contact.surface == "finger":
-        gap = ca.fmax(gap, link.vertex_beyond[contact.index])
+        gap = _confine(gap, link.vertex_run[i], scene.fingers[contact.finger].length)
     elif contact.feature == "e":
-        gap = ca.fmax(gap, link.edge_beyond[contact.index])
-        gap = gap if touching else ca.fmax(gap, link.other_gap[contact.index] - line_gap)
+        gap = _confine(gap, link.edge_run[i], float(features.edge_lengths[i]))
+        gap = gap if touching else ca.fmax(gap, link.other_gap[i] - line_gap)
     else:
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)

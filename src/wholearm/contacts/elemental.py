@@ -89,10 +89,6 @@ class LinkFeatures(NamedTuple):
     # beyond the tip's centre it is
     arc_gap: Expression
     arc_run: Expression
-    # vertex_beyond, edge_beyond (1, n_v) [m]: how far each vertex is beyond the ends of the link,
-    # and the tip beyond those of each edge
-    vertex_beyond: Expression
-    edge_beyond: Expression
 
 
 class Features(NamedTuple):
@@ -102,7 +98,7 @@ class Features(NamedTuple):
     vertices: Expression  # (2, n_v) [m]: world positions of the vertices
     edge_normals: Expression  # (2, n_v): normals of the edges into the object
     edge_lengths: Array  # (n_v,) [m]
-    links: tuple[LinkFeatures, LinkFeatures]  # finger 1, finger 2
+    links: tuple[LinkFeatures, ...]  # finger 1, finger 2
 
 
 class Geometry(NamedTuple):
@@ -182,9 +178,8 @@ def _build_features(scene: Scene) -> Features:
     vertices = rotation @ ca.DM(body.T) + ca.repmat(z[:2], 1, len(body))
     along = rotation @ ca.DM((run / lengths[:, None]).T)
     normals = ca.vertcat(-along[1, :], along[0, :])
-    hull = vertices, along, normals, ca.DM(lengths).T
-    links = tuple(_build_link(scene, finger, z, *hull) for finger in range(2))
-    return Features(z, vertices, normals, lengths, (links[0], links[1]))
+    links = (_build_link(scene, finger, z, vertices, along, normals) for finger in range(2))
+    return Features(z, vertices, normals, lengths, tuple(links))
 
 
 _FEATURES = Store(_build_features, lambda scene: scene.shape)
@@ -197,7 +192,6 @@ def _build_link(
     vertices: Expression,
     along: Expression,
     edge_normals: Expression,
-    edge_lengths: Expression,
 ) -> LinkFeatures:
     link = scene.fingers[finger]
     axis = ca.vertcat(ca.cos(z[3 + finger]), ca.sin(z[3 + finger]))
@@ -208,20 +202,17 @@ def _build_link(
     from_base = vertices - ca.repmat(base, 1, count)
     to_tip = ca.repmat(tip, 1, count) - vertices
     edge_gap = -ca.sum1(edge_normals * to_tip) - link.radius
-    vertex_run, edge_run = axis.T @ from_base, ca.sum1(along * to_tip)
     return LinkFeatures(
         base=base,
         tip=tip,
         normal=normal,
         vertex_gap=normal.T @ from_base - link.radius,
-        vertex_run=vertex_run,
+        vertex_run=axis.T @ from_base,
         other_gap=_find_largest_others(ca.horzsplit(edge_gap)),
         edge_gap=edge_gap,
-        edge_run=edge_run,
+        edge_run=ca.sum1(along * to_tip),
         arc_gap=ca.sqrt(ca.sum1(to_tip**2)) - link.radius,
         arc_run=-axis.T @ to_tip,
-        vertex_beyond=ca.fmax(-vertex_run, vertex_run - link.length),
-        edge_beyond=ca.fmax(-edge_run, edge_run - edge_lengths),
     )
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -205,16 +204,16 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
         return Curve(formation, tuple(panels), s, text, reached)
 
     slip = formation.evaluate_slip(z[None])[0]
-    step, start, tangent, guess = 0.5 * rho, 0.0, heading, None
+    step, start, tangent = 0.5 * rho, 0.0, heading
     while start < LONGEST * rho:
-        panel, factor, guess = build_panel(formation, slip, z, tangent, start, step, guess)
+        panel, factor = build_panel(formation, slip, z, tangent, start, step)
         step *= factor
         if panel is None:
             if step < 1e-6 * rho:
                 return end(start, f"the contacts become dependent at {describe_pose(z)}")
             continue
         panels.append(panel)
-        crossing = _first_crossing(panel, margins)
+        crossing = find_crossing(panel, margins)
         if crossing is not None:
             s, active = crossing
             place = describe_pose(panel.interpolate(np.array([s]))[0][0])
@@ -236,7 +235,7 @@ def until_distance(formation: Formation, until: Until, z: Array) -> Array:
     return np.asarray(z[:, 2] - until.value)
 
 
-def _first_crossing(
+def find_crossing(
     panel: Panel, margins: Callable[[Array], Array]
 ) -> tuple[float, list[int]] | None:
     """First arc length at which margins [rho or rad] fall below zero, and which ones do so."""
@@ -283,28 +282,10 @@ def _refine_dips(grid: Array, values: Array) -> Array:
     return np.setdiff1d(low + (high - low) * inner, grid)
 
 
-class PanelGuess(NamedTuple):
-    """Chebyshev coefficients, shape (NODES, 5), of a panel that is too long."""
-
-    step: float
-    coefficients: Array
-
-    def evaluate(self, step: float) -> Array:
-        """Points at the nodes of a shorter panel, shape (NODES, 5)."""
-        angles = np.arccos(2 * step / self.step * _chebyshev()[0] - 1)
-        return np.asarray(np.cos(np.outer(angles, np.arange(NODES))) @ self.coefficients)
-
-
 def build_panel(
-    formation: Formation,
-    slip: Array,
-    z: Array,
-    heading: Array,
-    start: float,
-    step: float,
-    guess: PanelGuess | None,
-) -> tuple[Panel | None, float, PanelGuess | None]:
-    """Panel of about `step` metres, if it converges, factor on the next step, and guess for it.
+    formation: Formation, slip: Array, z: Array, heading: Array, start: float, step: float
+) -> tuple[Panel | None, float]:
+    """Panel of about `step` metres, if it converges, and factor on the next step.
 
     Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
     """
@@ -312,8 +293,7 @@ def build_panel(
     metric = metric_weights(formation.scene)
     projection = heading * metric
     u = step * unit
-    points = z + u[:, None] * heading if guess is None else guess.evaluate(step)
-    rho = formation.scene.polygon.gyration_radius
+    points, rho = z + u[:, None] * heading, formation.scene.polygon.gyration_radius
     kinematics, size = formation.evaluate(points, points), np.inf
     for count in range(12):
         slid = formation.evaluate_slip(points) - slip
@@ -322,7 +302,7 @@ def build_panel(
         try:
             change = np.linalg.solve(matrix, -residual[..., None])[..., 0]
         except np.linalg.LinAlgError:
-            return None, SHORTER, None
+            return None, SHORTER
         points = points + change
         kinematics = formation.evaluate(points, points)
         before, size = size, np.abs(change * np.sqrt(metric)).max()
@@ -330,7 +310,7 @@ def build_panel(
         if size < 3e-8 * rho or size > 10 * rho or (count > 2 and size > before / 2):
             break
     if not size < 3e-8 * rho:
-        return None, SHORTER, None
+        return None, SHORTER
     z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
     speed = np.sqrt(z_u**2 @ metric)
     scaled = np.column_stack([(points - z) * np.sqrt(metric) / rho, speed])
@@ -338,8 +318,8 @@ def build_panel(
     # A trailing coefficient of 0.3 of the largest one is aimed at.
     factor = (0.3 * RESOLVED / max(tail, 1e-3 * RESOLVED)) ** (1 / (NODES - 1))
     if speed.max() > 1.5 or tail > RESOLVED:
-        return None, max(min(factor, 0.8), SHORTER**2), PanelGuess(step, analyse @ points)
-    return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None]), factor, None
+        return None, max(min(factor, 0.8), SHORTER**2)
+    return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None]), factor
 
 
 @lru_cache(maxsize=1)

@@ -88,13 +88,11 @@ class PathLimits(NamedTuple):
         """The two rows that a row of `eliminate` combines, shape (..., 2)."""
         return np.asarray(np.stack(np.triu_indices(self.rows.shape[-2], 1), axis=1)[row])
 
-    def meet(
-        self, b: Array, pairs: NDArray[np.int64], slack: float | Array = 0.0
-    ) -> tuple[Array, Array]:
-        """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have a slack, (n, 2)."""
+    def meet(self, b: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
+        """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have no slack."""
         k = np.arange(len(b))[:, None]
         (r1, r2), (l1, l2) = (self.rows[k, pairs, column].T for column in (A, LAMBDA))
-        one, other = (self.at(b)[k, pairs] - slack).T
+        one, other = self.at(b)[k, pairs].T
         with np.errstate(divide="ignore", invalid="ignore"):
             det = r1 * l2 - r2 * l1
             return (other * l1 - one * l2) / det, (one * r2 - other * r1) / det

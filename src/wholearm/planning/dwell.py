@@ -48,7 +48,6 @@ from ..simulation.system import SLOW, build_system
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
-from .path_domain.path_nlp import find_internal_force_range
 from .phase_plan import PhasePlan, Plans, Settled, end_of
 
 
@@ -112,7 +111,9 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
     """The range of internal forces that hold the object at an end of a phase [N], or an error."""
-    low, high = (float(bound[place]) for bound in find_internal_force_range(data, 0.0))
+    still = np.zeros_like(data.grid.s)
+    bounds = data.find_limits(data.nodes).find_internal_force_range(still, still)
+    low, high = (float(bound[place]) for bound in bounds)
     if low <= high:
         return low, high
     where = "end" if place else "start"

@@ -228,12 +228,6 @@ class BorderEdge:
         """Limits of motions along it, on the usual grid."""
         return find_border_limits(self.curve, *self.terms, INTERVALS)
 
-    def find_limits(self, intervals: int) -> BorderLimits:
-        """Limits of motions along it on a grid of about so many intervals."""
-        if intervals == INTERVALS:
-            return self.limits
-        return find_border_limits(self.curve, *self.terms, intervals)
-
     @property
     def formation(self) -> Formation:
         """The formation along it."""
@@ -360,8 +354,11 @@ def edge_along(
     duration: float | str = last.ends
     # Where motions hardly pass, a coarse grid may let none pass.
     for intervals in () if last.ends else (INTERVALS, FINE * INTERVALS):
-        pairs = zip(borders, ratios, strict=True)
-        limits = [b.find_limits(intervals).with_speed_ratio(ratio) for b, ratio in pairs]
+        limits = [border.limits for border in borders]
+        if intervals != INTERVALS:
+            limits = [find_border_limits(b.curve, *b.terms, intervals) for b in borders]
+        pairs = zip(limits, ratios, strict=True)
+        limits = [each.with_speed_ratio(ratio) for each, ratio in pairs]
         duration = estimate_duration(limits)
         if not isinstance(duration, str):
             return Edge(start, stop, steps, duration, borders=borders, ratios=ratios)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
 
-from ..common.arrays import Array, find_root
+from ..common.arrays import Array
 from ..common.errors import InfeasibleError
 from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
-from ..geometry.curve import Curve, describe_pose, refine
+from ..geometry.curve import Curve, describe_pose
 from ..geometry.path_guess import close_contacts
-from ..geometry.tracing import HELD
+from ..geometry.tracing import HELD, find_crossing, until_distance
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene
 
@@ -114,39 +115,27 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
 
     A flush goal without x is met only at the ends of curves.
     """
-    scene = curve.formation.scene
+    formation, scene = curve.formation, curve.formation.scene
+    until = Until(coordinate="phi", value=goal.phi)
     if goal.flush is not None:
-        if goal.x is None or not is_flush(scene, curve.formation.contacts, goal.flush):
+        if goal.x is None or not is_flush(scene, formation.contacts, goal.flush):
             return None
-        s = _find_first(curve, 0, goal.x)
-        return None if s is None else (s, Until(coordinate="x", value=goal.x))
-    assert goal.phi is not None
-    s = _find_first(curve, 2, goal.phi)
-    if s is None:
+        until = Until(coordinate="x", value=goal.x)
+    first = float(until_distance(formation, until, curve.start[None])[0])
+    if abs(first) < HELD:
+        return None
+
+    def measure_left(z: Array) -> Array:
+        return np.asarray(np.sign(first) * until_distance(formation, until, z)[:, None])
+
+    crossings = filter(None, (find_crossing(panel, measure_left) for panel in curve.panels))
+    s = next((s for s, _ in crossings), math.inf)
+    if s > curve.length:
         return None
     x = float(curve.interpolate(np.array([s]))[0][0, 0])
     if goal.x is not None and abs(x - goal.x) > HELD * scene.scales.length:
         return None
-    return s, Until(coordinate="phi", value=goal.phi)
-
-
-def _find_first(curve: Curve, row: int, value: float) -> float | None:
-    """First place along a curve at which a coordinate takes a value, beyond its start."""
-    grid = np.concatenate([refine(panel.s, curve.length) for panel in curve.panels])
-    grid = np.unique(grid[grid <= curve.length])
-    off = curve.interpolate(grid)[0][:, row] - value
-    least = HELD * (curve.formation.scene.scales.length if row == 0 else 1.0)
-    if abs(off[0]) < least:
-        return None
-    changes = np.flatnonzero(off[:-1] * off[1:] <= 0)
-    if not len(changes):
-        return None
-    k = int(changes[0])
-    return find_root(
-        lambda s: float(curve.interpolate(np.array([s]))[0][0, row]) - value,
-        float(grid[k]),
-        float(grid[k + 1]),
-    )
+    return s, until
 
 
 def require_reach(scene: Scene, goal: Goal, near: float) -> None:

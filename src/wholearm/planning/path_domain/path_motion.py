@@ -198,12 +198,6 @@ class Elements:
             self._b[:, 1:-1] *= 1 - c
             self._b[:, 2:] += 4 * c * a / (powers + 2)
 
-    @property
-    def stretch(self) -> Array:
-        """Slope ds/dy at the nodes over the element's length, (E, p + 1)."""
-        y, c, power = self._y.reshape(-1, NODES), self.grid.bends[:, None], self._power[:, None]
-        return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
-
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
         power, c = self._power[k // NODES], self.grid.bends[k // NODES]

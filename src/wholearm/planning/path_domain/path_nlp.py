@@ -48,7 +48,6 @@ from .path_motion import (
     SIGNS,
     TO_HOLD,
     TO_REST,
-    Elements,
     Grid,
     Profile,
     find_basis,
@@ -473,23 +472,12 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     Where limits forbid even the slowest one, it is as quick as a fall: in units of a slow one the
     regularization would weigh too much.
     """
-    limits, fall, grid = data.find_limits(data.nodes), _fall(data), data.grid
-    scene, most = data.curve.formation.scene, data.torque_limit
+    limits, fall = data.find_limits(data.nodes), _fall(data)
 
     def possible(height: float) -> bool:
         a, b = _parabola(data, height)
         low, high = limits.find_internal_force_range(a, b)
-        kept = bool(((low <= high) & (low < np.inf)).all() and (b <= limits.cap).all())
-        if not (kept and grid.held):
-            return kept
-        # Torque rates and commands at the nodes.
-        profile, lags = Profile(a, b, find_middle(data, low, high)[1]), scene.actuator_lag
-        stretch = np.maximum(Elements(grid, profile).stretch, 1e-6)
-        y_t = np.sqrt(b).reshape(-1, NODES) / stretch / np.diff(grid.edges)
-        tau = data.nodes.forces.tau(*profile).reshape(-1, NODES, 2)
-        rates = np.stack(list_slopes())[grid.kinds] @ tau * y_t[..., None]
-        command = np.abs(tau + lags * rates) * (lags > 0)
-        return bool((np.abs(rates) <= data.rate_limit).all() and (command <= most).all())
+        return bool(((low <= high) & (low < np.inf) & (b <= limits.cap)).all())
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -535,34 +523,30 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
     return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
 
 
-def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """Least and largest internal force that limits allow at each node."""
-    return data.find_limits(data.nodes).find_internal_force_range(*_parabola(data, height))
-
-
-def find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array]:
-    """The internal force amid its range, and amid a part of it; zero without a range."""
-    finite, force = np.isfinite(low + high) & (low <= high), data.curve.formation.scene.scales.force
-    near = np.minimum(high, low + 40.0 * np.maximum(force, np.abs(low)))
-    whole, part = (np.where(finite, (low + end) / 2, 0.0) for end in (high, near))
-    return whole, part
-
-
 def guess_below(data: PhaseData, fastest: Fastest) -> Profile:
     """A guess somewhat slower than the minimum-time profile."""
     a, b = (_BELOW * np.interp(data.grid.s, *pair) for pair in (fastest.slopes, fastest[:2]))
-    allowed = data.find_limits(data.nodes).find_internal_force_range(a, b)
-    return Profile(a, b, find_middle(data, *allowed)[1])
+    return _complete(data, a, b)[0]
+
+
+def _complete(data: PhaseData, a: Array, b: Array) -> tuple[Profile, Array]:
+    """A motion with the internal force amid a part of its range, and the one amid all of it.
+
+    Both are zero without a range.
+    """
+    low, high = data.find_limits(data.nodes).find_internal_force_range(a, b)
+    force = data.curve.formation.scene.scales.force
+    near = np.minimum(high, low + 40.0 * np.maximum(force, np.abs(low)))
+    finite = np.isfinite(low + high) & (low <= high)
+    part, whole = (np.where(finite, (low + end) / 2, 0.0) for end in (near, high))
+    return Profile(a, b, part), whole
 
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    a, b = _parabola(data, height)
-    allowed = data.find_limits(data.nodes).find_internal_force_range(a, b)
-    whole, middle = find_middle(data, *allowed)
+    profile, whole = _complete(data, *_parabola(data, height))
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
-    duration = np.pi / 2 * length / np.sqrt(height)
-    force = max(0.5 * weight, data.epsilon, float(np.abs(middle).mean()))  # the least unit
-    profile, torque = Profile(a, b, middle), data.torque_limit
+    duration, torque = np.pi / 2 * length / np.sqrt(height), data.torque_limit
+    force = max(0.5 * weight, data.epsilon, float(np.abs(profile.lam).mean()))  # the least unit
     squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
     most = max(force, float(np.abs(whole).mean()))
