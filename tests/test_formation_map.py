@@ -55,7 +55,7 @@ from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning.lower_bound import look_along
 from wholearm.problem.read import read_problem
 from wholearm.scene.model import Finger
-from wholearm.search.edges import Edge, cut_curve
+from wholearm.search.edges import Edge
 from wholearm.search.places import is_at, make_place
 from wholearm.search.roadmap import Roadmap
 
@@ -575,7 +575,8 @@ def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
     expected = []
     for forth in curves:
         way = -forth.evaluate(np.array([forth.length])).z_s[0]
-        back = cut_curve(trace_curve(forth.formation, forth.end, way, Until()), forth.length)
+        back = trace_curve(forth.formation, forth.end, way, Until())
+        back = replace(back, length=forth.length, reached=True)
         for own in (forth, back):
             try:
                 expected.append(look_along((own,), problem.epsilon, 100))

@@ -32,14 +32,12 @@ from .edge_plans import ROUGH
 from .edges import (
     DEPENDENT,
     Blocked,
-    BorderEdge,
     Edge,
-    cut_curve,
     describe_steps,
     edge_along,
     point_out,
 )
-from .places import make_place, measure_along, require_reach
+from .places import make_place, require_reach
 from .roadmap import Roadmap
 
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
@@ -51,13 +49,6 @@ HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
 TIMES, AT_LEAST = 4.0, 20.0
 """Limit of processor time for other hands: over that of the search, and at least [s]."""
 LISTED, FAILED = 2, 1  # most reasons in a message, and most of routes without a plan
-
-
-class CutBorder(NamedTuple):
-    """A blocked border that leaves the reached part of the roadmap."""
-
-    blocked: Blocked
-    border: BorderEdge  # as far as it is to be followed
 
 
 class Opening(NamedTuple):
@@ -99,27 +90,7 @@ def list_cut(search: RouteSearch) -> list[Blocked]:
     return sorted(cut.values(), key=rank)
 
 
-def list_cut_borders(search: RouteSearch) -> list[CutBorder]:
-    """At most `CUT` borders of the cut, the nearest to the goal first."""
-    borders = list[CutBorder]()
-    for blocked in list_cut(search):
-        for chain in search.roadmap.follow(blocked.start):
-            border = chain.borders[0]
-            if chain.edge is blocked:
-                borders.append(CutBorder(blocked, border))
-                break
-            if set(border.formation.contacts) == set(blocked.steps[-1].contacts):
-                goal = measure_along(border.curve, search.goal)
-                if goal is not None and goal[1] == blocked.steps[-1].until:
-                    part = replace(border, curve=cut_curve(border.curve, goal[0]))
-                    borders.append(CutBorder(blocked, part))
-                    break
-        if len(borders) == CUT:
-            break
-    return borders
-
-
-def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
+def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
     by_key: dict[str, tuple[Parameter, list[float]]] = {}
     for index, cut in enumerate(cuts):
@@ -128,7 +99,7 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
             friction = number.key.startswith("friction")
             tried = number.value, 0.0 if friction else number.value * FARTHEST**number.sign
 
-            def opens(number: Parameter, value: float, cut: CutBorder = cut) -> bool:
+            def opens(number: Parameter, value: float, cut: Blocked = cut) -> bool:
                 return isinstance(edge_changed(cut, Change(number, value)), Edge)
 
             for change in find_changes([number], {number: tried}.__getitem__, opens):
@@ -143,9 +114,9 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
     return sorted(openings, key=rank)
 
 
-def edge_changed(cut: CutBorder, change: Change) -> Edge | Blocked:
+def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
     """The edge along a border of the changed problem, or why no motion follows it."""
-    blocked, border, key = cut.blocked, cut.border, change.parameter.key
+    border, key = blocked.border, change.parameter.key
     if key == EPSILON:
         border = replace(border, terms=border.terms._replace(epsilon=change.value))
     else:
@@ -168,7 +139,7 @@ def find_opening(
     taken `seconds` of processor time.
     """
     report("looking for a number that opens the way")
-    cuts, tried = list_cut_borders(search), list[str]()
+    cuts, tried = list_cut(search)[:CUT], list[str]()
 
     def find(
         change: Change, beyond: Sequence[int], planned: bool
@@ -180,7 +151,7 @@ def find_opening(
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
         for k in beyond:
-            before = search.reached.get(cuts[k].blocked.start.key)
+            before = search.reached.get(cuts[k].start.key)
             edge = edge_changed(cuts[k], change)
             if before is not None and isinstance(edge, Edge):
                 lasts[k] = edge

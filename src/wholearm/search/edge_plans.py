@@ -38,7 +38,7 @@ from ..problem.table import describe_phase
 from ..results.plan_record import ROLLS
 from ..scene.model import Scene
 from .edges import DEPENDENT, INTERVALS, Edge, EdgeStep, describe_steps, point_out
-from .places import RoadmapPlace, close_place, measure_apart
+from .places import RoadmapPlace, close_place
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
 # Distances are in radii of gyration and radians.
@@ -259,7 +259,8 @@ def _aim(phase: Phase, z: Array, edge: Edge) -> Phase:
     A contact may be gained both ways along a border; then the end is given by x or phi.
     """
     try:
-        if measure_apart(edge.stop.scene, trace_phase(phase, z).end, edge.stop.z) <= OFF:
+        away, scene = trace_phase(phase, z).end - edge.stop.z, edge.stop.scene
+        if away**2 @ metric_weights(scene) <= (OFF * scene.scales.length) ** 2:
             return phase
     except InputError:
         pass

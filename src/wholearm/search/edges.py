@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -203,6 +203,7 @@ class Blocked(NamedTuple):
     steps: tuple[EdgeStep, ...]
     reason: str
     stop: RoadmapPlace
+    border: BorderEdge  # the first one, as far as it is to be followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,11 +310,6 @@ def describe_steps(steps: Sequence[EdgeStep]) -> str:
     )
 
 
-def cut_curve(curve: Curve, length: float) -> Curve:
-    """The first part of a curve."""
-    return replace(curve, length=length, ending="", reached=True)
-
-
 def time_parts(border: BorderEdge, shares: Array) -> Array:
     """Estimated least times along first parts of a border, from rest to rest, shape (n,) [s].
 
@@ -350,7 +346,7 @@ def edge_along(
     start, last = borders[0].start, borders[-1].limits
     reason = last.closed or ("" if len(borders) > 1 else last.begins)
     if reason:
-        return Blocked(start, steps, reason, stop)
+        return Blocked(start, steps, reason, stop, borders[0])
     duration: float | str = last.ends
     # Where motions hardly pass, a coarse grid may let none pass.
     for intervals in () if last.ends else (INTERVALS, FINE * INTERVALS):
@@ -362,4 +358,4 @@ def edge_along(
         duration = estimate_duration(limits)
         if not isinstance(duration, str):
             return Edge(start, stop, steps, duration, borders=borders, ratios=ratios)
-    return Blocked(start, steps, Unstopped(duration), stop)
+    return Blocked(start, steps, Unstopped(duration), stop, borders[0])

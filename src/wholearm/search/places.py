@@ -87,12 +87,6 @@ def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
     return False
 
 
-def measure_apart(scene: Scene, z: Array, other: Array) -> float:
-    """Largest distance of configurations in a coordinate, in radii of gyration or radians."""
-    length = scene.scales.length
-    return float(np.abs((z - other) / [length, length, 1, 1, 1]).max())
-
-
 def is_flush(scene: Scene, contacts: Sequence[Contact], edge: int) -> bool:
     """Whether an edge lies on the palm with these contacts."""
     ends = {edge, (edge + 1) % scene.polygon.n_vertices}

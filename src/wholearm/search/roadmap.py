@@ -41,7 +41,6 @@ from .edges import (
     EdgeStep,
     Terms,
     Unstopped,
-    cut_curve,
     edge_along,
     follow_borders,
     point_out,
@@ -66,12 +65,7 @@ STEPS, MIDDLES, PART = make_cosine_grid(NODES)
 def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends: Array) -> Array:
     """Least times of straight paths inside cells from rest to rest, or infinite, shape (n,).
 
-    Parameters
-    ----------
-    epsilon : [N]
-    labels : (n, 3)                 contacts of each with palm, finger 1 and finger 2, by
-                                    `closing.contact_table`
-    starts, ends : (n, 2) [m, rad]  poses (x, phi)
+    `labels`, (n, 3), are of `closing.contact_table`; starts and ends, (n, 2), are poses (x, phi).
     """
     if not len(ends):
         return np.zeros(0)
@@ -492,7 +486,8 @@ class Chain:
         place = measure_along(last.curve, goal)
         if place is None:
             return None
-        return self._edge(place[1], replace(last, curve=cut_curve(last.curve, place[0])))
+        curve = replace(last.curve, length=place[0], ending="", reached=True)
+        return self._edge(place[1], replace(last, curve=curve))
 
     def _edge(self, until: Until, last: BorderEdge) -> Edge | Blocked:
         """The edge to rest at the end of the last border, or of a part of it."""
