@@ -18,6 +18,7 @@ from refused import advising, ask_shoved
 from rows import each
 from scenes import PENTAGON, box, shove
 from shipped import FOLDER, HEPTAGON, problem_of, tipping
+from toys import plan_path
 from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark import refusals
 from wholearm.benchmark.refusals import judge
@@ -40,7 +41,6 @@ from wholearm.planning.explain import (
     refuse,
     require_hold_at_ends,
 )
-from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import Guesses

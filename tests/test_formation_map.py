@@ -217,8 +217,8 @@ def test_every_change_of_cell_is_a_border(every: FormationMap) -> None:
 
 def test_plan_runs_along_borders(chart: FormationMap, curves: tuple[Curve, ...]) -> None:
     for curve in curves:
-        names = set(curve.formation.names)
-        own = [border for border in chart.borders if set(border.names) == names]
+        contacts = set(curve.formation.contacts)
+        own = [border for border in chart.borders if set(border.contacts) == contacts]
         points = curve.evaluate(np.linspace(0.0, curve.length, 40)).z[:, [0, 2]]
         assert distance_to(own, points).max() < 2e-5
 
@@ -260,7 +260,7 @@ def test_directions_agree_with_a_linear_programme(every: FormationMap) -> None:
             slack = most_slack(every.problem, border, k, way)
             # Neighbours give the tangent to a percent or so; clear cases only.
             if slack is not None and abs(slack) > 1e-6:
-                assert answer == (slack > 0), (border.names, border.points[k], way)
+                assert answer == (slack > 0), (border.contacts, border.points[k], way)
                 seen.append(bool(answer))
     assert sum(seen) > 20 and len(seen) - sum(seen) > 10
 

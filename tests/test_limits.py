@@ -15,6 +15,7 @@ from scipy.optimize import linprog
 from plane import SQUARE, make_formation, make_scene, with_speed_limit
 from rows import each
 from scenes import roll
+from toys import plan_path
 from wholearm import Finger, Objective, Polygon, Scene
 from wholearm.common.arrays import Array, find_minima
 from wholearm.common.errors import InfeasibleError, Parameter
@@ -38,7 +39,6 @@ from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import choose_sampling, prepare
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import TimeMotion

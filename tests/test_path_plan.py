@@ -21,7 +21,7 @@ from plane import measure_slip, place_corners, unbalance, with_speed_limit
 from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
 from scenes import box, fading, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
-from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
+from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia, plan_path
 from wholearm import Problem
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
@@ -35,7 +35,7 @@ from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_path_nlp
-from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
+from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem

@@ -22,6 +22,7 @@ import wholearm
 from retelling import Retelling, Units
 from rows import each
 from shipped import BOX, FOLDER, HEPTAGON, part_of, problem_of, text_of
+from toys import plan_path
 from wholearm import Formation, InputError, Plan, PlanOptions, Problem, Scene, TorqueProfile
 from wholearm.analysis.robustness import (
     Robustness,
@@ -49,7 +50,6 @@ from wholearm.mechanics.dynamics import (
 )
 from wholearm.mechanics.sensitivity import find_force_slopes, find_slopes_at
 from wholearm.mechanics.statics import Statics
-from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases

@@ -11,6 +11,7 @@ import pytest
 
 from rows import each
 from shipped import HEPTAGON, tipping
+from toys import plan_path
 from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
 from wholearm.benchmark.damage import look, run_file
 from wholearm.benchmark.refusals import (
@@ -33,7 +34,6 @@ from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.uniqueness import find_minors
-from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_toml
 

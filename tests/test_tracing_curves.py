@@ -24,6 +24,7 @@ from plane import (
 )
 from scenes import hexagon, measure_fingers, roll, tip
 from shipped import problem_of
+from toys import plan_path
 from wholearm import InputError, Phase, PlanOptions, Problem, Scene, Until, place_start
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
@@ -33,7 +34,6 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import POINTS, PathGuess, close_contacts, guess_phase
 from wholearm.geometry.tracing import trace_curve, trace_phases, until_distance
 from wholearm.mechanics.dynamics import metric_weights
-from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.time_plan import plan_phases
 
 NEVER = Until(coordinate="x", value=9.0)

@@ -51,7 +51,7 @@ from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
 from ..planning.path_domain.path_motion import NODES, PathMotion, Profile, lay_out
 from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp, guess
-from ..planning.path_domain.path_plan import plan_path
+from ..planning.path_domain.path_plan import plan_curves
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
@@ -368,7 +368,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     if study == FEW:
         motion, degree = make_slow_motion(instance, 2, 0.3), 14
     else:
-        motion, degree = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion, 6
+        motion, degree = plan_curves((curve,), problem.epsilon, PlanOptions(), (1,))[0].motion, 6
     looks = np.linspace(0.0, motion.duration, 201)
     if motion.evaluate(looks).c_n.min() <= 0:
         return None
@@ -450,7 +450,7 @@ def find_least_time(instance: Instance) -> float:
     bound = bound_least_time((curve,), epsilon)
     if bound is not None:
         return bound.value
-    return plan_path(curve, epsilon, PlanOptions(accuracy=1e-7), 1).motion.duration
+    return plan_curves((curve,), epsilon, PlanOptions(accuracy=1e-7), (1,))[0].motion.duration
 
 
 def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
@@ -460,7 +460,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data), len(data.grid.steps), Objective.TIME)
-    return lambda: plan_path(curve, epsilon, options, 1).torque
+    return lambda: plan_curves((curve,), epsilon, options, (1,))[0].torque
 
 
 def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:

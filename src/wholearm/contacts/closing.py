@@ -340,9 +340,7 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
     """Groups of formations with the same friction at each contact, with one that stands for all."""
     table = contact_table(scene)
-    fingers = np.array([-1 if contact.finger is None else contact.finger for contact in table])[
-        labels
-    ]
+    fingers = np.array([-1 if c.finger is None else c.finger for c in table])[labels]
     for kind in np.unique(fingers, axis=0):
         rows = (fingers == kind).all(axis=1)
         yield Formation(scene, tuple(table[k] for k in labels[int(rows.argmax())].tolist())), rows

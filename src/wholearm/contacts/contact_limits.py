@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,14 +25,6 @@ FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the
 ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
 
 
-class _Segment(NamedTuple):
-    """A link as expressions: its joint and tip, shape (2, 1), and its length [m]."""
-
-    base: Expression
-    tip: Expression
-    length: Expression
-
-
 def build_finger_gap(scene: Scene) -> Expression:
     """Return the gap between the two links [m], an expression of the features' symbol z."""
     axes, _ = _build_separation()
@@ -46,8 +37,9 @@ def _list_numbers(scene: Scene) -> Array:
     return np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
 
 
-def _separate(one: _Segment, two: _Segment) -> Expression:
-    """Gap between the axes of two links, by separating axes.
+@lru_cache(maxsize=1)
+def _build_separation() -> tuple[Expression, Batch]:
+    """CasADi function of theta and (base, length) of both links: the gap between their axes.
 
     The distance of two convex bodies is the largest separation of their projections over all
     directions d, or minus the penetration depth. For two segments the candidates are both sides of
@@ -57,34 +49,24 @@ def _separate(one: _Segment, two: _Segment) -> Expression:
 
     is their distance when apart, minus the depth when they overlap, and continuous.
     """
-    links, lengths = (one, two), (one.length, two.length)
-    axes = [(link.tip - link.base) / link.length for link in links]
+    theta, numbers = ca.SX.sym("theta", 2), ca.SX.sym("numbers", 6)
+    bases, lengths = (numbers[:2], numbers[3:5]), (numbers[2], numbers[5])
+    axes = [ca.vertcat(ca.cos(theta[k]), ca.sin(theta[k])) for k in range(2)]
+    tips = [bases[k] + lengths[k] * axes[k] for k in range(2)]
     parts = []
-    for part, other, axis in ((one, two, axes[0]), (two, one, axes[1])):
-        ends = rotate_quarter(axis).T @ ca.horzcat(other.base - part.base, other.tip - part.base)
+    for k, other in ((0, 1), (1, 0)):
+        away = ca.horzcat(bases[other] - bases[k], tips[other] - bases[k])
+        ends = rotate_quarter(axes[k]).T @ away
         parts += [ca.fmin(ends[0], ends[1]), -ca.fmax(ends[0], ends[1])]
     # From base and tip of link 1 to base and tip of link 2; each link goes on from there along its
     # axis or against it, and what goes on towards the other link takes from the separation.
-    first = ca.horzcat(one.base, one.base, one.tip, one.tip)
-    second = ca.horzcat(two.base, two.tip, two.base, two.tip)
-    run = second - first
-    distance = ca.sqrt(ca.sum1(run**2) + ROUNDING * sum(lengths) ** 2)
+    first = ca.horzcat(bases[0], bases[0], tips[0], tips[0])
+    run = ca.horzcat(bases[1], tips[1], bases[1], tips[1]) - first
+    distance = ca.sqrt(ca.sum1(run**2) + ROUNDING * (lengths[0] + lengths[1]) ** 2)
     onwards = axes[0].T @ run * ca.DM([[1.0, 1.0, -1.0, -1.0]]) * lengths[0]
     backwards = axes[1].T @ run * ca.DM([[-1.0, 1.0, -1.0, 1.0]]) * lengths[1]
     parts.append((distance - (ca.fmax(onwards, 0) + ca.fmax(backwards, 0)) / distance).T)
-    return ca.mmax(ca.vertcat(*parts))
-
-
-@lru_cache(maxsize=1)
-def _build_separation() -> tuple[Expression, Batch]:
-    """CasADi function of theta and (base, length) of both links: the gap between their axes."""
-    theta, numbers = ca.SX.sym("theta", 2), ca.SX.sym("numbers", 6)
-    links = []
-    for k in range(2):
-        base, length = numbers[3 * k : 3 * k + 2], numbers[3 * k + 2]
-        axis = ca.vertcat(ca.cos(theta[k]), ca.sin(theta[k]))
-        links.append(_Segment(base, base + length * axis, length))
-    function = ca.Function("finger_gap", [theta, numbers], [_separate(*links)])
+    function = ca.Function("finger_gap", [theta, numbers], [ca.mmax(ca.vertcat(*parts))])
     return function, Batch(function)
 
 

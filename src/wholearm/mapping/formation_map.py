@@ -75,11 +75,6 @@ class Border:
     back: Flags  # (n,): with decreasing coordinate; both False where nothing is flush
     ambiguous: Flags  # (n,): feasible in some direction, but contact forces are not unique
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the contacts."""
-        return tuple(contact.name for contact in self.contacts)
-
 
 @dataclass(frozen=True, eq=False)
 class Crossing:

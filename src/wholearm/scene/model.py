@@ -467,12 +467,10 @@ class Scene:
 
     def quicken(self, factor: float) -> Scene:
         """The scene with torque rate limits and 1 / lags of the motors times a factor."""
-        right, left = (
-            replace(
-                finger,
-                torque_rate_limit=factor * finger.torque_rate_limit,
-                actuator_lag=finger.actuator_lag / factor,
-            )
-            for finger in self.fingers
-        )
+
+        def quicken_finger(finger: Finger) -> Finger:
+            rate, lag = factor * finger.torque_rate_limit, finger.actuator_lag / factor
+            return replace(finger, torque_rate_limit=rate, actuator_lag=lag)
+
+        right, left = map(quicken_finger, self.fingers)
         return replace(self, fingers=(right, left))

@@ -117,9 +117,7 @@ JUMP = 5e-3  # change of a joint angle at the end of a ray that is none [rad]
 NEAREST = 0.02  # least length of a path to a pose, in radii of gyration or radians
 TIED = 1 - 1e-9
 """Ratio below which a time is less than another: of mirrored paths the first is taken."""
-RELEASES = np.array(
-    [0.15, 0.4, 0.6, 0.75, 0.88]
-)  # places of releases, over the length of the border
+RELEASES = np.array([0.15, 0.4, 0.6, 0.75, 0.88])  # places of releases, over the border's length
 NEAR = 1.0  # longest shift of a landing to a goal, in radii of gyration
 
 

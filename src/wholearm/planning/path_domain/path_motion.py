@@ -375,11 +375,8 @@ class PathMotion:
         k = self.grid.nonempty
         changes = np.flatnonzero(np.diff(self.grid.segment[k], prepend=-1))
         edges = [*self.times[k[changes]].tolist(), self.duration]
-        segments = self.grid.segment[k[changes]]
-        signs = (
-            Directions(*(part[0] for part in directions_of(self.curve, segments[j : j + 1])))
-            for j in range(len(segments))
-        )
+        parts = (self.curve.segments[j] for j in self.grid.segment[k[changes]])
+        signs = (Directions(part.Xi, part.sigma) for part in parts)
         return list(zip(edges, edges[1:], signs, strict=False))
 
     def evaluate(self, t: Array) -> Samples:
@@ -390,14 +387,9 @@ class PathMotion:
         formation = self.curve.formation
         forces = inverse(formation, *point[:3], directions, point.kinematics)
         c_n, c_t = split_forces(formation, forces.c(a, b, lam), directions.Xi)
-        return Samples(
-            point.z,
-            point.z_s * np.sqrt(b)[:, None],
-            point.z_s * a[:, None] + point.z_ss * b[:, None],
-            forces.tau(a, b, lam),
-            c_n,
-            c_t,
-        )
+        acceleration = point.z_s * a[:, None] + point.z_ss * b[:, None]
+        motion = point.z, point.z_s * np.sqrt(b)[:, None], acceleration
+        return Samples(*motion, forces.tau(a, b, lam), c_n, c_t)
 
 
 def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:

@@ -68,13 +68,6 @@ _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under ra
 WORTH = 0.02  # largest relative cost of such a start
 
 
-def plan_path(
-    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None = None
-) -> PhasePlan[PathMotion]:
-    """Plan one phase along a curve, from rest to rest; see `plan_curves`."""
-    return plan_curves((curve,), epsilon, options, (phase,), duration)[0]
-
-
 def plan_curves(
     curves: Sequence[Curve],
     epsilon: float,
