@@ -36,7 +36,7 @@ from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
-from wholearm.contacts.closing import contact_table, evaluate_contacts
+from wholearm.contacts.closing import contact_table, evaluate_each
 from wholearm.figures.map_figure import draw_map
 from wholearm.figures.plots import draw_torques, scale_margins
 from wholearm.figures.snapshots import choose_snapshots, draw_snapshot
@@ -619,7 +619,9 @@ def test_what_touches_at_a_place_of_the_map_is_told() -> None:
         assert len(own["contacts"]) >= freedoms[kind]
         label = [table[name] for name in own["contacts"]]
         # Poses are rounded to 1e-5 m and rad, and links are 0.2 m long.
-        assert np.abs(evaluate_contacts(scene, label, np.array(own["z"])).C).max() < 1e-5
+        z = np.array(own["z"])
+        labels = np.broadcast_to(label, (len(z), len(label)))
+        assert np.abs(evaluate_each(scene, labels, z).C).max() < 1e-5
         seen.add(kind)
     assert seen == set(freedoms)
 

@@ -9,7 +9,7 @@ touches. Rates along a straight path (x', phi') with x'' = phi'' = 0 follow from
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -57,17 +57,6 @@ def contact_table(scene: Scene) -> tuple[Contact, ...]:
 @lru_cache(maxsize=1024)
 def _make_single(scene: Scene, index: int) -> Formation:
     return Formation(scene, (contact_table(scene)[index],))
-
-
-def evaluate_contacts(
-    scene: Scene, label: Sequence[int], z: Array, v: Array | None = None
-) -> Kinematics:
-    """Rows of some contacts of `contact_table` at n configurations, with A' v for v, or else z.
-
-    Many formations have few contacts in common, but each contact is in many of them.
-    """
-    parts = [_make_single(scene, index).evaluate(z, z if v is None else v) for index in label]
-    return Kinematics(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
 def first_contact(scene: Scene, finger: int) -> int:

@@ -22,7 +22,6 @@ from ..contacts.closing import (
     Numbers,
     close_fingers,
     contact_table,
-    evaluate_contacts,
     evaluate_each,
     find_reach,
     group_alike,
@@ -231,7 +230,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
         z = border.z[end]
         # Where a finger's first touch jumps across its joint, not all contacts touch at once.
         label = sorted(table.index(contact) for contact in met)
-        gaps = np.abs(evaluate_contacts(scene, label, z[None]).C[0])
+        gaps = np.abs(evaluate_each(scene, np.array([label]), z[None]).C[0])
         contacts = tuple(table[k] for k in np.array(label)[gaps < scene.touching])
         if len(contacts) >= 5:
             edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))

@@ -122,12 +122,6 @@ class PhaseData(NamedTuple):
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
-    def pick_places(self) -> tuple[Places, Array]:
-        """`PLACES` of the checks of every solid interval, and their fractions."""
-        checks = self.sampling.checks
-        picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
-        return self.checks.pick(np.tile(picked, len(self.grid.nonempty))), checks[picked]
-
     def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
         table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty
@@ -292,8 +286,9 @@ def find_torques(
 
     By Chebyshev interpolation in time through torques within each interval.
     """
-    places, fractions = data.pick_places()
-    count = len(data.grid.nonempty)
+    checks, count = data.sampling.checks, len(data.grid.nonempty)
+    picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
+    places, fractions = data.checks.pick(np.tile(picked, count)), checks[picked]
     values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
     spans = np.concatenate([motion.durations(fractions) for motion in motions])
     degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)

@@ -218,7 +218,7 @@ class PathNLP:
     # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
     # shortfalls for `elastic`, or the least margin
     node: Columns
-    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
+    # `steps`, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limits at the nodes, column by column (the constant ones are part of the
     # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, bends of
     # elements and `sizes` of b for rate limits
@@ -242,8 +242,8 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     n, m, slow = intervals + 1, shape.rows, shape.slow
     effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
     soft = objective is Objective.ELASTIC
-    sizes = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
-    sizes |= {"lam": n * m, "speed": n * len(shape.fast)}
+    sizes = {"steps": intervals, "weight": 1, "calm": 1}
+    sizes |= {"a": n * m, "b": n * m, "lam": n * m, "speed": n * len(shape.fast)}
     if effort or slow:
         sizes |= {"torque": n * 2}
     if effort:
@@ -255,11 +255,11 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     symbols = p.make_symbols()
     b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
     extra = ca.SX.sym("extra", n, m if soft else int(late))
-    h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
+    h, fast = symbols.steps, list(shape.fast)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
     bends, scales = (symbols.bends.T, symbols.sizes) if slow else (None, ca.DM.ones(n))
-    b = ca.vertcat(ends[0] ** 2, b_inner * scales[1:-1], ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
+    b = ca.vertcat(0, b_inner * scales[1:-1], 0)
+    speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
     largest = ca.fmax(scales[1:], scales[:-1])
     lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
@@ -366,7 +366,6 @@ def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) 
         blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
     return np.asarray(
         nlp.p.join(
-            ends=np.zeros(2),
             steps=data.grid.steps / units.length,
             weight=[time_weight / units.power],
             calm=[force / units.press],

@@ -29,7 +29,6 @@ from ..refinement import SOLVES, refine
 from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
-    Switch,
     equidistribute,
     find_ends,
     find_fastest,
@@ -360,8 +359,7 @@ class PathIterate:
         places = np.array([switch.place for switch in fastest.switches])
         owner, breaks = np.searchsorted(starts[1:-1], places), list[Array]()
         for k, curve in enumerate(task.curves):
-            local = [Switch(place, True) for place in (places[owner == k] - starts[k]).tolist()]
-            curve_breaks = match(np.zeros(0), local, curve)[0]
+            curve_breaks = keep_apart(curve, places[owner == k] - starts[k])
             few = task.options.intervals and len(find_ends(curve, curve_breaks)) > elements
             breaks.append(curve_breaks[:0] if few else curve_breaks)
         parts = task.lay_out(breaks, elements)
