@@ -340,12 +340,9 @@ class Pattern:
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
         order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
-        rows, root = Independent(DEPENDENT), np.sqrt(system.mass)
-
-        def adds(row: Array) -> bool:
-            return rows.add(row / root)
-
-        kept = {k for k in order if presses[k] and adds(at.A[k])}
+        adds, root = Independent(DEPENDENT).add, np.sqrt(system.mass)
+        A, A_t = at.A / root, at.A_t / root
+        kept = {k for k in order if presses[k] and adds(A[k])}
         count, stuck, held = len(self.standing), [], []
         Xi, sigma = self.Xi.copy(), self.sigma.copy()
         sigma[self.joints] = answer.sign[count:]
@@ -359,10 +356,10 @@ class Pattern:
                     held.append(joint)
             elif (k := int(self.standing[j])) in kept:
                 Xi[k] = sign
-                if sign == 0 and adds(at.A_t[k]):
+                if sign == 0 and adds(A_t[k]):
                     stuck.append(k)
         # What touches without a force stays, for as long as it needs none.
-        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(at.A[k])}
+        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(A[k])}
         order = sorted(kept)
         pairs, stick = tuple(closed[k] for k in order), sorted((closed[k],) for k in stuck)
         signs = tuple(Xi[order].tolist()), tuple(sigma.tolist())
