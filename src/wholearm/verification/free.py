@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -246,19 +245,18 @@ def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
 def list_aliases(problem: Problem, phase: Phase) -> dict[str, set[str]]:
     """Contacts of features that those of a phase go on from, or go on as, one after the other."""
     aliases: dict[str, set[str]] = {name: set() for name in phase.formation.names}
-    behind, ahead = problem.phases[: phase.index + 1][::-1], problem.phases[phase.index :]
-    for phases in (behind, ahead):
-        names = {contact: contact.name for contact in phase.formation.contacts}
-        for one, other in pairwise(part.formation.contacts for part in phases):
-            pair = (one, other) if phases is ahead else (other, one)
+    formations = [part.formation.contacts for part in problem.phases]
+    for step in (-1, 1):
+        names, index = {contact: contact.name for contact in formations[phase.index]}, phase.index
+        while names and 0 <= index + step < len(formations):
+            pair = (formations[k] for k in sorted((index, index + step)))
             renamed = list_renamed(problem.scene, *pair)
-            if phases is behind:
+            if step < 0:
                 renamed = {new: old for old, new in renamed.items()}
-            names = {
-                renamed[contact]: name for contact, name in names.items() if contact in renamed
-            }
+            names = {renamed[one]: name for one, name in names.items() if one in renamed}
             for contact, name in names.items():
                 aliases[name].add(contact.name)
+            index += step
     return aliases
 
 
