@@ -25,7 +25,7 @@ from wholearm.planning import dwell
 from wholearm.planning.blocks import Planning, plan_block, plan_free
 from wholearm.planning.dwell import list_touching, settle_plans
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.phase_plan import PhasePlan, Settled
+from wholearm.planning.phase_plan import PhasePlan, Plans
 from wholearm.planning.replay_check import make_table
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
 from wholearm.problem.read import build_problem, read_own_problem
@@ -42,7 +42,7 @@ HELD = (0.019, 0.01, 0.01, 0.01, 0.0)
 PERIOD = 0.011
 
 
-def hold(changes: dict[str, Any], count: int = 5) -> tuple[Problem, Settled]:
+def hold(changes: dict[str, Any], count: int = 5) -> tuple[Problem, Plans]:
     """Plans of the first phases with their ends held, without planning them again."""
     plain = solved(HEPTAGON)
     problem, trajectory = plain.problem.with_(changes), plain.trajectory
@@ -60,10 +60,10 @@ def settled() -> Plan:
     plain = solved(HEPTAGON)
     changes = {"settle": HELD[1], "phases[1].settle": HELD[0], "phases[5].settle": HELD[-1]}
     problem, found = hold(changes)
-    torque = TorqueProfile.chain([plan.torque for plan in found.plans])
-    motion = assemble([plan.motion for plan in found.plans], torque, plain.trajectory.meta, 201)
-    both = zip(plain.phases, found.settlings, strict=True)
-    phases = tuple(phase._replace(settling=own) for phase, own in both)
+    torque = TorqueProfile.chain([plan.torque for plan in found])
+    motion = assemble([plan.motion for plan in found], torque, plain.trajectory.meta, 201)
+    both = zip(plain.phases, found, strict=True)
+    phases = tuple(phase._replace(settling=own.settling) for phase, own in both)
     plan = replace(plain, problem=problem, trajectory=motion, phases=phases)
     return replace(plan, trajectory=replace(motion, meta=write_meta(plan)))
 
@@ -79,12 +79,12 @@ def test_a_share_of_the_duration_is_spread_over_the_ends(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(dwell, "simulate_free", simulate)
     problem, found = hold({"settle": "10 %", "phases[2].settle": 0.002}, 3)
-    times = [own.duration if own else 0.0 for own in found.settlings]
+    times = [own.settling.duration if own.settling else 0.0 for own in found]
     plan = solved(HEPTAGON).trajectory
     duration = plan.phase_starts[3]
     assert times[1] == 0.002 and min(times) > 0
     assert sum(times) == pytest.approx(0.002 + 0.1 * duration, rel=1e-12)
-    torque = TorqueProfile.chain([plan.torque for plan in found.plans])
+    torque = TorqueProfile.chain([plan.torque for plan in found])
     for off in (problem.gap, -problem.gap):
         start = dwell.move_start(problem, off)
         assert start is not None

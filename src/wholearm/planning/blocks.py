@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.document import plain
 from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError, name_source
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
@@ -42,7 +41,6 @@ from .path_domain.path_plan import plan_curves
 from .phase_plan import (
     PER_SPEED,
     Plans,
-    Settled,
     assemble_motions,
     end_of,
     make_transition,
@@ -93,22 +91,20 @@ class Planning:
         return [plan for block in self.blocks for plan in block.plans]
 
     @cached_property
-    def settled(self) -> Settled:
+    def settled(self) -> Plans:
         """The plans with dwells at their ends, where the problem asks for these."""
-        plans, phases = self.plans, self.problem.phases
         if not self.problem.is_settled:
-            return Settled(plans, (None,) * len(phases))
+            return self.plans
         from .dwell import settle_plans
 
-        return settle_plans(self.problem, plans)
+        return settle_plans(self.problem, self.plans)
 
     @cached_property
     def trajectory(self) -> Trajectory:
         """The motion with dwells; of its `meta` only rolling contacts and modes."""
-        plans, formations = self.settled.plans, [phase.formation for phase in self.problem.phases]
-        motions, torques = [plan.motion for plan in plans], [plan.torque for plan in plans]
-        modes = plain([getattr(plan.motion, "modes", ()) for plan in self.plans])
-        return assemble_motions(motions, torques, formations, self.options.samples, modes=modes)
+        formations = [phase.formation for phase in self.problem.phases]
+        motions, torques = zip(*((plan.motion, plan.torque) for plan in self.settled), strict=True)
+        return assemble_motions(motions, torques, formations, self.options.samples)
 
     def allow(self, phases: Sequence[Phase]) -> float | None:
         """Longest duration of some phases in all [s], for the objective `margin`."""

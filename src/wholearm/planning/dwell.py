@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,22 +33,21 @@ from ..mechanics.dynamics import LAMBDA, ONE
 from ..mechanics.statics import Statics
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import (
-    SettledMotion,
+    HeldMotion,
     Settling,
     TorqueChange,
     change_torques,
     find_change_times,
 )
-from ..results.plan_record import ModeSpan
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Samples
+from ..results.trajectory import Motion
 from ..simulation.modes import Hold, Standstill, close_contacts, find_hold, find_opening
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
-from .phase_plan import PhasePlan, Plans, Settled, end_of
+from .phase_plan import PhasePlan, Plans, end_of
 
 
 class Junction(NamedTuple):
@@ -123,49 +122,6 @@ def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]
     )
 
 
-@dataclass(frozen=True, eq=False)
-class PausedMotion:
-    """A motion that begins after a pause at rest, in which torques and forces change."""
-
-    motion: Motion
-    change: TorqueChange
-    forces: Array  # (2, n_c) [N]: c_n and c_t before it; NaN if other contacts may share in them
-
-    @property
-    def pause(self) -> float:
-        """How long the pause lasts [s]."""
-        return self.change.duration
-
-    @property
-    def duration(self) -> float:
-        """How long the phase lasts [s]."""
-        return self.pause + self.motion.duration
-
-    @property
-    def contacts(self) -> tuple[str, ...]:
-        """Names of the phase's contacts."""
-        return self.motion.contacts
-
-    @property
-    def modes(self) -> tuple[ModeSpan, ...]:
-        """Its contact modes, if planned in the time domain: the first start with the pause."""
-        return tuple(
-            span._replace(start=span.start + self.pause if k else 0.0, stop=span.stop + self.pause)
-            for k, span in enumerate(getattr(self.motion, "modes", ()))
-        )
-
-    def evaluate(self, t: Array) -> Samples:
-        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        t = np.asarray(t, dtype=float)
-        samples = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
-        left = np.where(t < self.pause, 1 - self.change.share(t), 0.0)[:, None]
-        mixed = (
-            np.where(left > 0, left * first + (1 - left) * now, now)
-            for first, now in zip((self.change.before, *self.forces), samples[3:], strict=True)
-        )
-        return Samples(*samples[:3], *mixed)
-
-
 def add_pause(
     plan: PhasePlan[Motion], change: TorqueChange, formation: Formation, options: PlanOptions
 ) -> PhasePlan[Motion]:
@@ -184,7 +140,7 @@ def add_pause(
 
 
 def _pause(plan: PhasePlan[Motion], change: TorqueChange, forces: Array) -> PhasePlan[Motion]:
-    motion = PausedMotion(plan.motion, change, forces)
+    motion = HeldMotion(plan.motion, change, forces)
     return plan._replace(motion=motion, torque=TorqueProfile.chain([change.torque, plan.torque]))
 
 
@@ -193,9 +149,9 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
 
     Its value stays as it is.
     """
-    if isinstance(motion := plan.motion, PausedMotion):
-        torque = plan.torque.cut(motion.pause, float(plan.torque.breaks[-1]))
-        torque = TorqueProfile(torque.breaks - motion.pause, torque.coefficients)
+    if isinstance(motion := plan.motion, HeldMotion):
+        torque = plan.torque.cut(motion.begin, float(plan.torque.breaks[-1]))
+        torque = TorqueProfile(torque.breaks - motion.begin, torque.coefficients)
         plan = plan._replace(motion=motion.motion, torque=torque)
     change = change_torques(formation.scene, before, plan.end_torques[0])
     # Other contacts than the phase's may help to hold the object until it moves.
@@ -212,18 +168,19 @@ class DwellEnd(NamedTuple):
     firm: bool  # whether torques are of the largest margin, also if they do not close gaps
 
 
-def settle_plans(problem: Problem, plans: Plans) -> Settled:
-    """Add the dwells that the problem asks for to phases that come to rest."""
+def settle_plans(problem: Problem, plans: Plans) -> Plans:
+    """The plans with the dwells that the problem asks for where phases come to rest."""
     places = find_places(problem, plans)
     if problem.settle_share:
         ends = share_time(problem, plans, places)
     else:
-        ends = find_ends(
-            problem, places, [problem.settles(phase) or 0.0 for phase in problem.phases]
-        )
-    numbered = zip(problem.phases, ends, strict=True)
-    settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
-    return Settled(hold_plans(problem, plans, ends), tuple(settlings))
+        times = [problem.settles(phase) or 0.0 for phase in problem.phases]
+        ends = find_ends(problem, places, times)
+    triples = zip(hold_plans(problem, plans, ends), problem.phases, ends, strict=True)
+    return [
+        plan if end is None else plan._replace(settling=_describe(problem, phase, end))
+        for plan, phase, end in triples
+    ]
 
 
 def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
@@ -263,13 +220,13 @@ def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) 
             plan = begin_from(plan, phase.formation, before)
         before = end.hold.tau if end is not None and end.hold is not None else None
         if end is not None and before is not None:
-            change, ramp = None, 0.0
+            dwell = TorqueProfile(np.array([0.0, end.time]), before[None, :, None])
             if problem.scene.has_slow_motors:
                 change = change_torques(problem.scene, plan.end_torques[1], before)
-                ramp = change.duration
-            motion = SettledMotion(plan.motion, ramp + end.time, before, change)
-            torque = TorqueProfile.chain([plan.torque, motion.torque])
-            plan = plan._replace(motion=motion, torque=torque)
+                dwell = TorqueProfile.chain([change.torque, dwell]) if change.duration else dwell
+            motion = plan.motion if isinstance(plan.motion, HeldMotion) else HeldMotion(plan.motion)
+            torque = TorqueProfile.chain([plan.torque, dwell])
+            plan = plan._replace(motion=replace(motion, dwell=dwell), torque=torque)
         held.append(plan)
     return held
 

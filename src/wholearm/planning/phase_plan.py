@@ -39,6 +39,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     stages: Sequence[object] = ()  # of the NLP, in the scene's units; none along curves
     error: float = math.nan  # estimated relative error of the value of all phases in one NLP
     unheld: float = math.nan  # value with free torques, where they are held over control periods
+    settling: Settling | None = None  # the dwell at its end
 
     @property
     def end_torques(self) -> Array:
@@ -50,13 +51,6 @@ Plans = list[PhasePlan[Motion]]
 PlanPart = Callable[[int, int, Array, PlanOptions, float | None], Plans]
 """Plans phases `start` to `stop` of a block, without the latter, from a configuration and within a
 duration: from rest to rest, with what joins them passed in motion."""
-
-
-class Settled(NamedTuple):
-    """Plans of all phases with their dwells; None at ends without one."""
-
-    plans: list[PhasePlan[Motion]]
-    settlings: tuple[Settling | None, ...]
 
 
 def combine(goal: Objective, values: Sequence[float]) -> float:

@@ -176,13 +176,12 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
 def _list_phases(
     planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness]
 ) -> tuple[PlannedPhase, ...]:
-    settled = planning.settled
     return tuple(
         PlannedPhase(
             phase.number,
             ledger[phase.number],
             plan.value,
-            held.motion.duration,
+            plan.motion.duration,
             tuple(contact.name for contact in phase.formation.rolling),
             getattr(plan.motion, "modes", ()),
             plan.sequences,
@@ -190,12 +189,10 @@ def _list_phases(
             plan.attempt,
             plan.error,
             *unique[phase.index],
-            settled.settlings[phase.index],
+            plan.settling,
             None if math.isnan(plan.unheld) else plan.unheld,
         )
-        for phase, plan, held in zip(
-            planning.problem.phases, planning.plans, settled.plans, strict=True
-        )
+        for phase, plan in zip(planning.problem.phases, planning.settled, strict=True)
     )
 
 

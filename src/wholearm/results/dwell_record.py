@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
 from ..scene.model import Scene
+from .plan_record import ModeSpan
 from .torque import TorqueProfile
 from .trajectory import Motion, Samples, Trajectory, split_motion
 
@@ -130,23 +131,32 @@ class Settling(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SettledMotion:
-    """A phase whose end is held at rest by constant torques; contact forces are not known there."""
+class HeldMotion:
+    """A motion with rest before it, in which torques change, and after it, in which they hold.
+
+    Contact forces are not known after it.
+    """
 
     motion: Motion
-    held: float  # [s]: how long, with the time in which torques change into these
-    tau: Array  # (2,) [N m]
-    change: TorqueChange | None = None  # from those of the motion's end, where none may step
+    pause: TorqueChange | None = None  # of the torques before it
+    # (2, n_c) [N]: c_n and c_t before the pause; NaN if other contacts may share in them
+    forces: Array = field(default_factory=lambda: np.zeros((2, 0)))
+    dwell: TorqueProfile | None = None  # torques after it, from 0 on; steady in the last piece
 
     @property
-    def ramp(self) -> float:
-        """The time in which torques change [s]."""
-        return self.change.duration if self.change else 0.0
+    def begin(self) -> float:
+        """When the motion begins [s]."""
+        return self.pause.duration if self.pause else 0.0
+
+    @property
+    def end(self) -> float:
+        """When the motion ends [s]."""
+        return self.begin + self.motion.duration
 
     @property
     def duration(self) -> float:
-        """How long the phase lasts, its end included [s]."""
-        return self.motion.duration + self.held
+        """How long the phase lasts [s]."""
+        return self.end + (self.dwell.duration if self.dwell else 0.0)
 
     @property
     def contacts(self) -> tuple[str, ...]:
@@ -154,36 +164,44 @@ class SettledMotion:
         return self.motion.contacts
 
     @property
-    def torque(self) -> TorqueProfile:
-        """The torques of the end alone, from 0 on."""
-        steady = np.array([0.0, self.held - self.ramp])
-        hold = TorqueProfile(steady, self.tau[None, :, None])
-        if self.change is None or not self.ramp:
-            return hold
-        return TorqueProfile.chain([self.change.torque, hold])
+    def modes(self) -> tuple[ModeSpan, ...]:
+        """Its contact modes, if planned in the time domain: the first start with the pause."""
+        return tuple(
+            span._replace(start=span.start + self.begin if k else 0.0, stop=span.stop + self.begin)
+            for k, span in enumerate(getattr(self.motion, "modes", ()))
+        )
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        return self._take(t, np.asarray(t > self.motion.duration))
+        t = np.asarray(t, dtype=float)
+        return self._evaluate(t, t > self.end)
 
     def sample(self, count: int) -> tuple[Array, Samples]:
-        """`count` even rows of the motion, and the two ends of the time in which it is held.
+        """`count` even rows until the motion ends, and those of the dwell at its ends.
 
-        Between them where the torques are those that hold it, if that takes a while.
+        Also one from which on its torques are steady.
         """
-        end = self.motion.duration
-        inner = [end + self.ramp] if self.ramp else []
-        t = np.append(np.linspace(0.0, end, count), [end, *inner, self.duration])
-        return t, self._take(t, np.asarray(np.arange(len(t)) >= count))
+        t = np.linspace(0.0, self.end, count)
+        if self.dwell is not None:
+            t = np.append(t, self.end + sort_unique(self.dwell.breaks[[0, -2, -1]]))
+        return t, self._evaluate(t, np.arange(len(t)) >= count)
 
-    def _take(self, t: Array, held: NDArray[np.bool_]) -> Samples:
-        """Samples at times from the start of the phase, at rest where the end is held."""
-        end, rows = self.motion.duration, held[:, None]
-        samples = self.motion.evaluate(np.minimum(t, end))
-        tau = self.torque.at(np.clip(t - end, 0.0, self.held)) if self.ramp else self.tau
-        z_dot, z_ddot = (np.where(rows, 0.0, part) for part in (samples.z_dot, samples.z_ddot))
-        forces = (np.where(rows, np.nan, part) for part in (samples.c_n, samples.c_t))
-        return Samples(samples.z, z_dot, z_ddot, np.where(rows, tau, samples.tau), *forces)
+    def _evaluate(self, t: Array, held: NDArray[np.bool_]) -> Samples:
+        """Samples, of which some are those of the dwell."""
+        samples = self.motion.evaluate(np.clip(t - self.begin, 0.0, self.motion.duration))
+        if self.pause is not None:
+            left = np.where(t < self.begin, 1 - self.pause.share(t), 0.0)[:, None]
+            mixed = (
+                np.where(left > 0, left * first + (1 - left) * now, now)
+                for first, now in zip((self.pause.before, *self.forces), samples[3:], strict=True)
+            )
+            samples = Samples(*samples[:3], *mixed)
+        if self.dwell is None:
+            return samples
+        rows, tau = held[:, None], self.dwell.at(t - self.end)
+        rest = 0.0, 0.0, tau, np.nan, np.nan  # of z', z'', torques and forces
+        parts = (np.where(rows, *pair) for pair in zip(rest, samples[1:], strict=True))
+        return Samples(samples.z, *parts)
 
 
 def assemble(
@@ -193,7 +211,7 @@ def assemble(
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, forces, start = [], [], [], 0.0
     for motion in motions:
-        if isinstance(motion, SettledMotion):
+        if isinstance(motion, HeldMotion):
             local, row = motion.sample(samples)
         else:
             local = np.linspace(0.0, motion.duration, samples)
