@@ -199,16 +199,11 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
     def sort(nlp: time_nlp.TimeNLP, of_x: Array, of_g: Array) -> dict[str, float]:
         """Sums over the rows and unknowns of each limit."""
         sums = dict[str, float]()
-        for layout, rows in zip(nlp.layouts, (each.limits for each in nlp.rows_of), strict=True):
-            parts = [
-                (side, of_x[layout.forces[..., k]].sum() + of_g[rows.presses[..., k]].sum())
-                for k, side in enumerate(rows.pressed)
-            ]
-            parts += [(s, of_g[rows.others[..., k]].sum()) for k, s in enumerate(rows.sides)]
-            parts += [(side, of_x[unknowns].sum()) for side, unknowns in rows.bounded.items()]
+        for rows in nlp.rows_of:
             names, sides = _name_rows(rows.limits), rows.limits.sides[0]
-            for side, value in parts:
-                sums[names[sides[side]]] = sums.get(names[sides[side]], 0.0) + float(value)
+            for side, on_rows, indices in rows.parts:
+                name, value = names[sides[side]], float((of_g if on_rows else of_x)[indices].sum())
+                sums[name] = sums.get(name, 0.0) + value
         return sums
 
     costs = sort(made.nlp, np.abs(on_x), np.abs(on_g))

@@ -46,7 +46,6 @@ from .stage import (
 )
 from .time_motion import MotionResponse, StageMotion, make_motions
 from .time_nlp import (
-    MARGIN,
     SLIDING,
     Target,
     TimeNLP,
@@ -235,7 +234,7 @@ class TimeSearch:
             high_g[nlp.duration_row] = self.duration
         if self.goal is Objective.MARGIN:
             # Solving for more than the saturated margin takes long.
-            high[nlp.layouts[-1].nodes[-1, MARGIN]] = 1.1 * self.most_margin
+            high[nlp.layouts[-1].margin[-1]] = 1.1 * self.most_margin
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
@@ -635,15 +634,11 @@ def _choose_halvings(
         return []
     on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
     nlp, prices, times = solution.nlp, list[Array](), list[NDArray[np.int64]]()
-    each = zip(nlp.layouts, nlp.rows_of, misses, motions, strict=True)
-    for layout, of_stage, miss, motion in each:
+    for rows, miss, motion in zip(nlp.rows_of, misses, motions, strict=True):
         # Relative cost of raising limits by their misses, by multipliers.
-        rows, price = of_stage.limits, np.zeros_like(miss.held)
-        c_n = layout.forces[..., : rows.presses.shape[2]]
-        price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
-        price[:, rows.sides] = on_g[rows.others].sum(axis=1)
-        for side, unknowns in rows.bounded.items():
-            price[:, side] = on_x[unknowns].sum(axis=1)
+        price = np.zeros_like(miss.held)
+        for side, on_rows, indices in rows.parts:
+            price[:, side] += (on_g if on_rows else on_x)[indices].sum(axis=1)
         cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
         prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
         # Errors of collocation decrease with the scheme's order, costs with the third one.

@@ -1,21 +1,9 @@
 """NLP of stages in the time domain by direct collocation, for any number of degrees of freedom.
 
 A stage has one formation and fixed directions of friction, in K intervals of unknown durations h
-with d collocation points. Torques are polynomials in each interval and may step between. Unknowns
-are z and z' at the nodes, h, and z, z', z'' and the contact forces c at every point, where
-
-    C(z) = 0,  P z' = 0,  P z'' + P' z' = 0,
-    M5 z'' + B z' = g - D sigma + S tau + G^T c,
-    c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0,
-    |c_t| <= mu (c_n - epsilon) (rolling).
-
-Contacts hold without drift, and friction opposes motion. With an orthonormal basis N of the null
-space of P at a guess of each interval, the differential equations are collocated by
-
-    N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
-
-No other row has h, so that a stage may vanish. Rates that equations keep at zero have no sign
-constraint, which would leave the solver no interior. All quantities are in the scene's units.
+with d collocation points. Its equations are in the README. No row but those of collocation has h,
+so that a stage may vanish. Rates that equations keep at zero have no sign constraint, which would
+leave the solver no interior. All quantities are in the scene's units.
 
 Rate-limited torques have control points c_0 ... c_n in each interval and are continuous; with rate
 limit R
@@ -68,24 +56,22 @@ from ..options import Objective
 from .stage import LimitMisses, Scheme, Stage, StagePoints, blend, make_scheme
 
 SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
-Z, V = slice(0, 5), slice(5, 10)
-"""Slices of a node's unknowns: z and z'. With a margin, that follows."""
-STATE, MARGIN = 10, 10
 
 
 @dataclass(frozen=True, eq=False)
 class StageLayout:
-    """Indices of one stage's unknowns."""
+    """Indices of one stage's unknowns; those of `StagePoints` have the shapes there."""
 
-    nodes: Indices  # (K + 1, n): z and z' at the ends of intervals, and a margin if there is one
-    h: Indices  # (K,): durations of the intervals
-    tau: Indices  # (K, 2 m): control points of the torques in each interval, one after the other
-    z: Indices  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
+    nodes: Indices
+    z: Indices
     v: Indices
     a: Indices
-    forces: Indices  # (K, d, n_f)
-    short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
+    forces: Indices
+    tau: Indices
     impulses: Indices  # of the impact that leads to the next stage, if one does
+    h: Indices  # (K,): durations of the intervals
+    margin: Indices  # (K + 1, 1) or (K + 1, 0): copies of a margin or relaxation at the nodes
+    short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     begin: Indices  # begin, finish: c_n, c_t and friction of the joints at rest at both ends, of
     finish: Indices  # continuous torques
 
@@ -96,64 +82,65 @@ class StageLayout:
 
 
 def lay_out(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    target: Target,
-    held: bool = False,
+    stages: Sequence[Stage], scheme: Scheme, target: Target, held: bool = False
 ) -> list[StageLayout]:
     """Indices of the unknowns of successive stages; `held`: torques hold what rests."""
     layouts: list[StageLayout] = []
-    stop, d, with_margin = 0, scheme.degree, int(target.chained)
-    for stage, coming in zip(stages, [*stages[1:], None], strict=True):
-        point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
+    stop, d, m, with_margin = 0, scheme.degree, scheme.controls, int(target.chained)
+
+    def take(*shape: int) -> Indices:
+        nonlocal stop
+        indices = stop + np.arange(int(np.prod(shape))).reshape(shape)
+        stop += indices.size
+        return indices
+
+    for k, stage in enumerate(stages):
+        K, formation = stage.intervals, stage.formation
         # In elastic mode every limit but those of speeds has a shortfall in each interval.
-        soft = make_limits(stage.formation, target.epsilon).without(SPEED).limits
+        soft = make_limits(formation, target.epsilon).without(SPEED).limits
         short = len(soft) * (target.objective is Objective.ELASTIC)
-        end = 0 if scheme.ends else STATE
-        sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
-        interval = Columns(**sizes, end=end, short=short, m=with_margin)
-        begins = held and (stage is stages[0] or stages[len(layouts) - 1].rests)
-        begin = stop + np.arange((2 * stage.formation.n_contacts + 2) * begins)
-        first = stop + len(begin) + np.arange(STATE + with_margin)
-        starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
-        columns = {
-            name: starts[:, None] + np.arange(part.start, part.stop)
-            for name, part in interval.slices.items()
-        }
-        points = columns["points"].reshape(stage.intervals, d, point.count)
-        at = {name: points[..., part] for name, part in point.slices.items()}
-        ends = points[:, -1, :STATE] if scheme.ends else columns["end"]
-        nodes = np.vstack([first, np.hstack([ends, columns["m"]])])
-        stop = int(first[-1]) + 1 + interval.count * stage.intervals
-        ends_in_impact = coming is not None and stage.ends_in_impact
-        extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
-        rest = 2 * stage.ending.n_contacts + 2
+        points = d * (15 + formation.n_constraints)
+        begins = held and (not k or stages[k - 1].rests)
+        begin = take((2 * formation.n_contacts + 2) * begins)
+        first, first_margin = take(10), take(with_margin)
+        interval = Columns(
+            h=1, tau=2 * m, points=points, end=10 * (not scheme.ends), short=short, m=with_margin
+        )
+        table = take(K, interval.count)
+        at = {name: table[:, part] for name, part in interval.slices.items()}
+        of_points = at["points"].reshape(K, d, -1)
+        z, v, a, forces = np.split(of_points, [5, 10, 15], axis=2)
+        ends = of_points[:, -1, :10] if scheme.ends else at["end"]
+        jumps = stage.ends_in_impact and k + 1 < len(stages)
         layouts.append(
             StageLayout(
-                nodes=nodes,
-                h=columns["h"][:, 0],
-                tau=columns["tau"],
-                **at,
-                short=columns["short"],
-                impulses=stop + np.arange(extra),
+                np.vstack([first, ends]).reshape(K + 1, 2, 5),
+                z,
+                v,
+                a,
+                forces,
+                at["tau"].reshape(K, m, 2),
+                impulses=take(stages[k + 1].formation.n_constraints if jumps else 0),
+                h=at["h"][:, 0],
+                margin=np.vstack([first_margin, at["m"]]),
+                short=at["short"],
                 begin=begin,
-                finish=stop + np.arange(rest * (held and stage.rests)),
+                finish=take((2 * stage.ending.n_contacts + 2) * (held and stage.rests)),
             )
         )
-        stop += extra + len(layouts[-1].finish)
     return layouts
+
+
+_TABLES = StagePoints._fields[2:]
 
 
 def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: float) -> Array:
     """Unknowns as one vector."""
     x = np.zeros(layouts[-1].stop)
     for part, layout in zip(points, layouts, strict=True):
-        x[layout.z], x[layout.v], x[layout.a] = part.z, part.v, part.a
-        x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(len(part.tau), -1)
-        x[layout.h], x[layout.short] = part.duration * part.fractions, 1.0
-        x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
-        x[layout.nodes[:, MARGIN:]] = margin
-        x[layout.impulses] = part.impulses
+        for name in _TABLES:
+            x[getattr(layout, name)] = getattr(part, name)
+        x[layout.h], x[layout.short], x[layout.margin] = part.duration * part.fractions, 1.0, margin
         for held, forces in (
             (layout.begin, part.forces[0, 0]),
             (layout.finish, part.forces[-1, -1]),
@@ -167,11 +154,8 @@ def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     parts = []
     for layout in layouts:
         duration = float(x[layout.h].sum())
-        nodes = x[layout.nodes[:, :STATE]].reshape(-1, 2, 5)
-        z, v, a, forces = (x[part] for part in (layout.z, layout.v, layout.a, layout.forces))
-        tau = x[layout.tau].reshape(len(layout.tau), -1, 2)
-        fractions, impulses = x[layout.h] / duration, x[layout.impulses]
-        parts.append(StagePoints(duration, fractions, nodes, z, v, a, forces, tau, impulses))
+        tables = [x[getattr(layout, name)] for name in _TABLES]
+        parts.append(StagePoints(duration, x[layout.h] / duration, *tables))
     return parts
 
 
@@ -190,6 +174,14 @@ class Target(NamedTuple):
         return self.objective in (Objective.MARGIN, Objective.RELAX)
 
 
+class LimitPart(NamedTuple):
+    """Where one side of the limits of a stage is kept: by rows, or bounds of unknowns."""
+
+    side: int
+    on_rows: bool
+    indices: Indices  # (K, n): of the rows, whose lower bounds these are, or of the unknowns
+
+
 @dataclass(frozen=True, eq=False)
 class StageRows:
     """Rows of one stage, interval by interval."""
@@ -198,26 +190,9 @@ class StageRows:
     bases: Array  # (K, 5, f): tangent space of each interval
     balance: Indices  # (K, d, 5): equations of motion at the points
     senses: Indices  # (K, d, n_rubbing): sliding directions of contacts with friction there
-    limits: LimitRows
-    monitor_rows: Indices  # (K, d, m): limits of the formation
-
-
-@dataclass(frozen=True, eq=False)
-class LimitRows:
-    """Limits of one stage, as rows and as bounds of unknowns."""
-
     limits: LimitSet
-    # (K, m, n_c): c_n at the start of each interval, and where bounds of unknowns are not enough
-    presses: Indices
-    others: Indices  # (K, d, n): at the points, sides of limits of several unknowns: friction cones
-    sides: NDArray[np.int64]  # (n,): which sides of the limits these are
-    bounded: dict[int, Indices]  # unknowns of the sides that are bounds of these
-    alone: bool  # whether c_n are bounded at the points themselves
-
-    @property
-    def pressed(self) -> NDArray[np.int64]:
-        """Sides of the limits that `presses` belong to."""
-        return np.flatnonzero(np.isin(self.limits.sides[0], self.limits.of(PRESS)))
+    parts: list[LimitPart]
+    monitor_rows: Indices  # (K, d, m): limits of the formation
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +228,7 @@ def build_time_nlp(
     layouts = lay_out(stages, scheme, target, held)
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
     start = stages[0].guess.nodes[0].ravel()
-    rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
+    rows.add_entries(rows.linear(10, low=start, high=start), layouts[0].nodes[0].ravel(), 1.0)
     rows_of, controls = [], scheme.controls
     # Weight of time: a little, against violations.
     of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
@@ -261,7 +236,7 @@ def build_time_nlp(
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
-        kernel, columns = effort_kernel(controls), {"tau": layout.tau, "h": layout.h[:, None]}
+        kernel, columns = effort_kernel(controls), _list_torques(layout)
         if target.objective is Objective.EFFORT:
             rows.add_copies(kernel, columns, cost=True)
         elif controls > 2:
@@ -269,24 +244,28 @@ def build_time_nlp(
             rows.add_copies(bend_kernel(controls), columns, weights, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
         cost[layout.short] = 1 / stage.intervals
-    duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    duration_row, last, (end_z, end_v) = -1, stages[-1], layouts[-1].nodes[-1]
     if stages[0].periods:
         add_periods(rows, stages, layouts)
     if held:
         hold_ends(rows, stages, layouts, target.epsilon)
     if target.chained:
-        cost[end[MARGIN]] = -1.0 if target.objective is Objective.MARGIN else 1.0
+        cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
         rows.add_entries(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         duration_row = int(total[0])
     if target.price is not None:
-        cost[end[Z]] = target.price
+        cost[end_z] = target.price
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
-    rest = rows.linear(N.shape[1])
-    rows.add_entries(rest[:, None], end[V], N.T)
+    rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
     built = rows.assemble(cost)
     book(SolverStatistics(build_time=time.perf_counter() - started))
     return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
+
+
+def _list_torques(layout: StageLayout) -> dict[str, Indices]:
+    """Control points of torques and durations of the intervals, as columns of kernels."""
+    return {"tau": layout.tau.reshape(len(layout.tau), -1), "h": layout.h[:, None]}
 
 
 def add_stage(
@@ -295,17 +274,17 @@ def add_stage(
     """Add the constraints of a stage."""
     formation, guess, (K, d) = stage.formation, stage.guess, layout.z.shape[:2]
     places, node, ends = guess.places(scheme.points), layout.nodes[:-1], layout.nodes[1:]
-    rows.add_equal(ends[:, MARGIN:], node[:, MARGIN:])
+    rows.add_equal(layout.margin[1:], layout.margin[:-1])
 
     # Collocation of z and z' along the tangent space.
     bases = np.array([tangent_basis(formation, z) for z in guess.z[:, d // 2]])
-    f, parts = bases.shape[2], ((layout.z, layout.v, Z), (layout.v, layout.a, V))
+    f, parts = bases.shape[2], ((layout.z, layout.v), (layout.v, layout.a))
     states = np.zeros((K, 2, len(scheme.rungs), f), dtype=np.int64)
-    for k, (state, rate, part) in enumerate(parts):
+    for k, (state, rate) in enumerate(parts):
         columns = {
-            "start": node[:, part],
+            "start": node[:, k],
             "points": state.reshape(K, -1),
-            "end": ends[:, part][:, : 5 * (not scheme.ends)],
+            "end": ends[:, k, : 5 * (not scheme.ends)],
             "rates": rate.reshape(K, -1),
             "h": layout.h[:, None],
         }
@@ -318,10 +297,10 @@ def add_stage(
         rows.add_entries(ratio_rows, layout.h[1:], -shares[:-1])
 
     # Equations of motion, contacts and sliding directions at the points.
-    homotopy, first = stage.onset > 0, node[:, Z] if formation.rolling else node[:, :0]
+    homotopy, first = stage.onset > 0, node[:, 0, : 5 * bool(formation.rolling)]
     kernel, least = point_kernel(formation, scheme.controls, homotopy), least_senses(stage, places)
     columns = {"z": layout.z, "v": layout.v, "a": layout.a, "forces": layout.forces}
-    columns |= {"tau": layout.tau[:, None], "first": first[:, None]}
+    columns |= {"tau": _list_torques(layout)["tau"][:, None], "first": first[:, None]}
     parameters = stage.directions._asdict() | {
         "shares": blend(scheme.points, scheme.controls),
         "least": np.maximum(least[..., : formation.n_contacts], 0.0),
@@ -336,7 +315,7 @@ def add_stage(
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     points = rows.add_copies(kernel, columns, parameters, low=low, high=high)
     if not scheme.ends:
-        columns = {"z": ends[:, Z], "v": ends[:, V], "first": first}
+        columns = {"z": ends[:, 0], "v": ends[:, 1], "first": first}
         rows.add_copies(end_kernel(formation), columns)
 
     # Limits of the formation that are not negative; that of the end's contact is zero there.
@@ -356,26 +335,28 @@ def add_stage(
             rows.add_copies(opening_kernel(formation, contact), columns, low=opening, high=np.inf)
 
     # The end.
-    until, end = stage.until, layout.nodes[-1]
+    until, (end_z, end_v) = stage.until, layout.nodes[-1]
     if stage.stop is not None:
         until, N = None, tangent_basis(formation, stage.stop)
         there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
-        rows.add_entries(there[:, None], end[Z], N.T)
+        rows.add_entries(there[:, None], end_z, N.T)
     turns, gained_softly = _list_free_turns(stage), stage.gained
     if stops(stage):
         turns, gained_softly = (), None
         N = tangent_basis(formation, guess.nodes[-1, 0])
-        rows.add_entries(rows.linear(N.shape[1])[:, None], end[V], N.T)
+        rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
     row = None if until is None else find_range_end(formation, until, guess.nodes[-1, 0])
     kernel = goal_kernel(formation, until, row, turns, gained_softly)
-    rows.add_copies(kernel, {"z": end[Z], "v": end[V]})
+    rows.add_copies(kernel, {"z": end_z, "v": end_v})
     if stage.lands and until is not None and until.contact is not None:
-        landing = landing_kernel(formation, until.contact)
-        rows.add_copies(landing, {"z": end[Z]}, high=np.inf)
-    limits = add_limits(rows, stage, layout, scheme, target)
+        alone, scene = Formation(formation.scene, (until.contact,)), formation.scene
+        ranges = tuple(range(len(build_limits(until.contact, scene))))
+        rows.add_copies(monitor_kernel(alone, ranges), {"z": end_z}, high=np.inf)
+    limits, parts = add_limits(rows, stage, layout, scheme, target)
     if slow:
         add_motors(rows, stage, layout, scheme)
-    return StageRows(states, bases, points[..., balance], points[..., senses], limits, monitor_rows)
+    of_points = points[..., balance], points[..., senses]
+    return StageRows(states, bases, *of_points, limits, parts, monitor_rows)
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
@@ -432,24 +413,25 @@ def join_stages(
     scheme: Scheme,
 ) -> None:
     """Continuous position and velocity from one stage to the next, or an impact."""
-    (stage, coming), layout = pair, layouts[0]
-    last, first = layout.nodes[-1], layouts[1].nodes[0]
+    (stage, coming), (layout, following) = pair, layouts
+    last, first = layout.nodes[-1], following.nodes[0]
     if stage.formation.scene.has_slow_motors and not stage.rests:
         join_motors(rows, stage, layouts, scheme)
-    same = np.delete(np.arange(len(first)), V) if stage.ends_in_impact else slice(None)
-    rows.add_equal(first[same], last[same])
+    same = slice(1 if stage.ends_in_impact else 2)
+    rows.add_equal(first[same].ravel(), last[same].ravel())
+    rows.add_equal(following.margin[0], layout.margin[-1])
     if stage.ends_in_impact:
         kernel = impact_kernel(stage.formation, coming.formation)
         high = np.zeros(kernel.y.count)
         high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
-        x = {"after": first[V], "before": last[V], "z": last[Z], "impulses": layout.impulses}
+        x = {"after": first[1], "before": last[1], "z": last[0], "impulses": layout.impulses}
         rows.add_copies(kernel, x, {"Xi": coming.directions.Xi}, high=high)
 
 
 def add_limits(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
-) -> LimitRows:
-    """Add rows for the limits of a stage."""
+) -> tuple[LimitSet, list[LimitPart]]:
+    """Add rows for the limits of a stage; also the limits, and where their sides are kept."""
     limits, goal = make_limits(stage.formation, target.epsilon), target.objective
     presses, weights = limits.of(PRESS), np.zeros(len(limits.low))
     if goal is Objective.MARGIN:
@@ -463,7 +445,7 @@ def add_limits(
         """Add the slack of a limit's row, if it has one."""
         if weights[row]:
             short = goal is Objective.ELASTIC
-            slack = layout.short[:, limits.owners[row]] if short else layout.nodes[:-1, MARGIN]
+            slack = layout.short[:, limits.owners[row]] if short else layout.margin[:-1, 0]
             rows.add_entries(added, slack[:, None], weights[row])
 
     # Normal forces by the polynomials through the points.
@@ -479,44 +461,48 @@ def add_limits(
     for i, shares in enumerate(scheme.interpolate(places)):
         for j in np.flatnonzero(np.abs(shares) > 1e-12):
             rows.add_entries(pressed[:, i], c_n[:, j], shares[j])
+    side_rows, signs, _ = limits.sides
+    parts = list[LimitPart]()
     for k, row in enumerate(presses):
         give(pressed[..., k], row)
+        side = int(np.flatnonzero(side_rows == row)[0])
+        parts.append(LimitPart(side, True, pressed[..., k]))
+        if not soft:  # with rows at the points the forces themselves have no bounds
+            parts.append(LimitPart(side, False, c_n[..., k]))
 
     # Rows of y at the points, and bounds of one torque or joint speed alone.
-    side_rows, signs, bounds = limits.sides
     column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
     alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
     single = np.where(alone, column - n_forces, -1)[side_rows]
     others = np.flatnonzero(~np.isin(side_rows, presses) & (single < 0))
     added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
-    for k, side in enumerate(others):
+    for k, side in enumerate(others.tolist()):
         of_y = np.split(signs[side] * limits.rows[side_rows[side]], [n_forces, n_forces + 2])
         for unknowns, of_them in ((layout.forces, of_y[0]), (layout.v[..., 3:], of_y[2])):
             for n in np.flatnonzero(of_them):
                 rows.add_entries(added[..., k], unknowns[..., n], of_them[n])
         for n in np.flatnonzero(of_y[1]):
             for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
-                torques = layout.tau[:, None, 2 * i + n]
-                rows.add_entries(added[..., k], torques, of_y[1][n] * shares)
+                rows.add_entries(added[..., k], layout.tau[:, None, i, n], of_y[1][n] * shares)
         give(added[..., k], side_rows[side])
-    bounded = dict[int, Indices]()
-    for side in np.flatnonzero(single >= 0):
-        k = int(single[side])
+        parts.append(LimitPart(side, True, added[..., k]))
+    for side in np.flatnonzero(single >= 0).tolist():
+        k, softened = int(single[side]), bool(weights[side_rows[side]])
         # Control points of a torque, or speeds at the points.
-        unknowns = layout.tau[:, k::2] if k < 2 else layout.v[..., 1 + k]
-        if not weights[side_rows[side]]:
-            bounded[int(side)] = unknowns
-            continue
-        added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
-        rows.add_entries(added_row, unknowns, signs[side])
-        give(added_row, side_rows[side])
-    return LimitRows(limits, pressed, added, others, bounded, alone=not soft)
+        indices = layout.tau[..., k] if k < 2 else layout.v[..., 1 + k]
+        if softened:
+            added_row = rows.linear(*indices.shape, high=np.inf)
+            rows.add_entries(added_row, indices, signs[side])
+            give(added_row, side_rows[side])
+            indices = added_row
+        parts.append(LimitPart(side, softened, indices))
+    return limits, parts
 
 
 def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> None:
     """Add the rows of one stage for rate-limited torques."""
     scene, K, n = stage.formation.scene, stage.intervals, scheme.controls - 1
-    tau = layout.tau.reshape(K, scheme.controls, 2)
+    tau = layout.tau
     rows.add_equal(tau[1:, 0], tau[:-1, -1], 1 / scene.torque_limit)
     limited = np.flatnonzero(np.isfinite(scene.torque_rate_limit))
     rates = rows.linear(K, n, len(limited), 2, high=np.inf)
@@ -533,9 +519,7 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
     if lagging:
         parameters = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
         kernel = command_kernel(scheme.controls, lagging)
-        rows.add_copies(
-            kernel, {"tau": layout.tau, "h": layout.h[:, None]}, parameters, high=np.inf
-        )
+        rows.add_copies(kernel, _list_torques(layout), parameters, high=np.inf)
 
 
 def join_motors(
@@ -545,7 +529,7 @@ def join_motors(
     layout, coming = layouts
     formation = stage.formation
     scale = 1 / formation.scene.torque_limit
-    rows.add_equal(coming.tau[0, :2], layout.tau[-1, -2:], scale)
+    rows.add_equal(coming.tau[0, 0], layout.tau[-1, -1], scale)
     shares = scheme.interpolate(np.ones(1))[0]
     for fading, slips in stage.fading:
         equation, share = rows.linear(1), float(formation.friction[fading]) if slips else 1.0
@@ -571,11 +555,11 @@ def hold_ends(
     """
     ends = list[tuple[Stage, Formation, Indices, Indices, Indices]]()
     for stage, layout in zip(stages, layouts, strict=True):
-        tau, z = layout.tau[[0, -1]], layout.nodes[[0, -1], Z]
+        z, tau = layout.nodes[[0, -1], 0], layout.tau
         if len(layout.begin):
-            ends.append((stage, stage.formation, z[0], layout.begin, tau[0, :2]))
+            ends.append((stage, stage.formation, z[0], layout.begin, tau[0, 0]))
         if len(layout.finish):
-            ends.append((stage, stage.ending, z[1], layout.finish, tau[1, -2:]))
+            ends.append((stage, stage.ending, z[1], layout.finish, tau[-1, -1]))
     for stage, formation, z, forces, tau in ends:
         n_c, scene = formation.n_contacts, formation.scene
         signs = np.zeros(n_c + 2)
@@ -604,25 +588,26 @@ def hold_ends(
             fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
             most = 1 - min(0.05, float(fastest))
             bound = rows.linear(1, low=-most, high=most)
-            rows.add_entries(bound, layouts[0].tau[0, joint], 1 / limit)
+            rows.add_entries(bound, layouts[0].tau[0, 0, joint], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
     """Sides without effect in each interval, as forces vanish or set in or slip, (K, n_sides)."""
     relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
-    if not stage.formation.scene.has_slow_motors:
-        return relieved
-    names, owners = stage.formation.names, limits.owners[limits.sides[0]]
-
-    def find(contact: int, *kinds: str) -> list[bool]:
-        side_limits = [limits.limits[k] for k in owners]
-        return [limit.kind in kinds and limit.part == names[contact] for limit in side_limits]
-
-    for contact, slips in stage.fading:
-        relieved[-1] |= find(contact, *((CONE,) if slips else (PRESS, CONE)))
-    for contact in stage.growing:
-        relieved[0] |= find(contact, PRESS, CONE)
+    if stage.formation.scene.has_slow_motors:
+        for contact, slips in stage.fading:
+            kinds = (CONE,) if slips else (PRESS, CONE)
+            relieved[-1] |= _find_sides(stage, limits, contact, *kinds)
+        for contact in stage.growing:
+            relieved[0] |= _find_sides(stage, limits, contact, PRESS, CONE)
     return relieved
+
+
+def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> NDArray[np.bool_]:
+    """Whether sides, (n_sides,), are of limits of some kinds of a contact."""
+    name, owners = stage.formation.names[contact], limits.owners[limits.sides[0]]
+    flags = [limit.kind in kinds and limit.part == name for limit in limits.limits]
+    return np.array(flags)[owners]
 
 
 class _Piece(NamedTuple):
@@ -668,12 +653,12 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
                     rows.add_entries(even, np.array([one.h]), other.share / size)
                     rows.add_entries(even, np.array([other.h]), -one.share / size)
                 if linear:
-                    slopes = {"before": one.tau, "after": other.tau}
+                    slopes = {"before": one.tau.ravel(), "after": other.tau.ravel()}
                     slopes |= {"h": np.array([one.h]), "coming": np.array([other.h])}
                     rows.add_copies(slope_kernel(), slopes)
         for before, after in pairwise(phase):
             if not goes_on and (linear or before.period == after.period):
-                rows.add_equal(after.tau[:2], before.tau[-2:], 1 / scene.torque_limit)
+                rows.add_equal(after.tau[0], before.tau[-1], 1 / scene.torque_limit)
 
 
 def find_bounds(
@@ -711,46 +696,39 @@ def find_bounds(
                 low[speeds] = one_way
             else:
                 high[speeds] = -one_way
-        limit_rows, n_c = rows.limits, stage.formation.n_contacts
-        sides, signs, values = limit_rows.limits.sides
-        more = raised.held * limit_rows.limits.scales[sides]
+        sides, signs, values = rows.limits.sides
+        least = signs * values + raised.held * rows.limits.scales[sides]
         # Forces that vanish or set in are only nonnegative.
-        more = np.where(find_relieved(stage, limit_rows.limits), -signs * values, more)
-        floor = values[limit_rows.pressed] + more[:, limit_rows.pressed]
-        # Where rows hold c_n at the points too, its own bounds must not.
-        if limit_rows.alone:
-            low[layout.forces[..., :n_c]] = floor[:, None]
-        low_g[limit_rows.presses] = floor[:, None]
-        low_g[limit_rows.others] = ((signs * values)[limit_rows.sides] + more[:, limit_rows.sides])[
-            :, None
-        ]
-        _free_equal(stage, limit_rows, layout, (low, low_g))
-        for side, unknowns in limit_rows.bounded.items():
-            if signs[side] > 0:
-                low[unknowns] = np.maximum(low[unknowns], values[side] + more[:, side, None])
+        least[find_relieved(stage, rows.limits)] = 0.0
+        for side, on_rows, indices in rows.parts:
+            floor = least[:, side, None]
+            if on_rows:
+                low_g[indices] = floor
+            elif signs[side] > 0:
+                low[indices] = np.maximum(low[indices], floor)
             else:
-                high[unknowns] = np.minimum(high[unknowns], values[side] - more[:, side, None])
+                high[indices] = np.minimum(high[indices], -floor)
+        if stage.formation.scene.has_slow_motors:
+            _free_equal(stage, rows, low, low_g)
         low_g[rows.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
         low_g[rows.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
     return (low, high), (low_g, high_g)
 
 
-def _free_equal(
-    stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
-) -> None:
+def _free_equal(stage: Stage, rows: StageRows, low_x: Array, low_g: Array) -> None:
     """Remove bounds, in place, of forces that are given by equations."""
-    if not stage.formation.scene.has_slow_motors:
-        return
-    low_x, low = lows
     for contact, slips in stage.fading:
-        if slips:
-            names = [rows.limits.limits[k].part for k in rows.limits.owners]
-            mask = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
-            low[rows.others[-1, -1, np.array(mask)[rows.sides]]] = -np.inf
-        else:
-            low_x[layout.forces[-1, -1, contact]] = -np.inf
-            low[rows.presses[-1, 1:2, contact]] = -np.inf
-    low[rows.presses[0, 0, list(stage.growing)]] = -np.inf
+        given = _find_sides(stage, rows.limits, contact, CONE if slips else PRESS)
+        for side, on_rows, indices in rows.parts:
+            if given[side] and on_rows and not slips:
+                low_g[indices[-1, 1:2]] = -np.inf
+            elif given[side]:
+                (low_g if on_rows else low_x)[indices[-1, -1]] = -np.inf
+    for contact in stage.growing:
+        given = _find_sides(stage, rows.limits, contact, PRESS)
+        for side, on_rows, indices in rows.parts:
+            if given[side] and on_rows:
+                low_g[indices[0, 0]] = -np.inf
 
 
 def build_applied(scene: Scene, tau: Expression, sigma: Expression) -> Expression:
@@ -878,14 +856,6 @@ def goal_kernel(
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]
     return build_kernel(x, goals=ca.vertcat(*parts))
-
-
-@share
-def landing_kernel(formation: Formation, contact: Contact) -> Kernel:
-    """Limits of the range of a contact with which a phase ends."""
-    x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
-    ranges = [limit.value for limit in build_limits(contact, formation.scene)]
-    return build_kernel(x, ranges=ca.vertcat(*ranges))
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
