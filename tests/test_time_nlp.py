@@ -380,7 +380,7 @@ def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
                 f += y
             for i, row in enumerate(own[k]):
                 g[row] = y[i]
-    return rows.assemble(cost), x, f, ca.vertcat(*g)
+    return rows.assemble(cost, np.zeros(0, dtype=np.int64)), x, f, ca.vertcat(*g)
 
 
 def evaluate(inputs: list[Expression], output: Expression, *values: Array) -> Array:
@@ -395,7 +395,7 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
     at, on_f, on_g = rng.normal(size=UNKNOWNS), rng.normal(size=1), rng.normal(size=g.numel())
     nlp, derivatives = built
     for own, expected in ((nlp["f"], f), (nlp["g"], g)):
-        got = evaluate([nlp["x"]], own, at)
+        got = evaluate([nlp["x"], nlp["p"]], own, at, np.zeros(0))
         np.testing.assert_allclose(got, evaluate([x], expected, at), atol=CLOSE)
     again, jacobian = derivatives["jac_g"](at, [])
     np.testing.assert_allclose(again.full(), evaluate([x], g, at), atol=CLOSE)

@@ -219,7 +219,8 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
         nlp, raised = other.build(stages), [stage.LimitMisses.none(each) for each in stages]
         bounds, bounds_g = time_nlp.find_bounds(nlp, stages, other.scheme, raised)
         x, written = time_nlp.pack(points, nlp.layouts, 0.0), nlp.assembled[0]
-        f, g = ca.Function("fg", [written["x"]], [written["f"], written["g"]])(x)
+        # Without a price of the end.
+        f, g = ca.Function("fg", [written[k] for k in "xp"], [written[k] for k in "fg"])(x, 0)
         of_x, of_g = _charge(on_x, x, *bounds), _charge(on_g, g.full()[:, 0], *bounds_g)
         sums, unit = sort(nlp, of_x, of_g), stage.unit_of(options.goal, scales)
         sums[costliest] += float(f) + float(of_x.sum() + of_g.sum()) - sum(sums.values())

@@ -210,17 +210,19 @@ class NlpRows:
         """Lower and upper bounds of all rows."""
         return np.concatenate(self._low), np.concatenate(self._high)
 
-    def assemble(self, cost: Array) -> tuple[dict[str, Expression], dict[str, Expression]]:
-        """Expressions of x, f and g with a linear cost, (n,), and `jac_g` and `hess_lag`.
+    def assemble(
+        self, cost: Array, priced: Indices
+    ) -> tuple[dict[str, Expression], dict[str, Expression]]:
+        """Expressions of x, p, f and g with a linear cost, (n,), and `jac_g` and `hess_lag`.
 
-        All rows that are not linear belong to one copy of a kernel.
+        p are prices of some unknowns. All rows that are not linear belong to one copy of a kernel.
         """
         size, blocks, none = len(cost), self._blocks, [np.zeros(0, dtype=np.int64)]
         linear = np.concatenate(self._linear or none)
         row, column, value = (
             np.concatenate([part[k] for part in self._entries] or none) for k in range(3)
         )
-        x, p, lam_f = ca.MX.sym("x", size), ca.MX.sym("p", 0), ca.MX.sym("lam_f")
+        x, p, lam_f = ca.MX.sym("x", size), ca.MX.sym("p", len(priced)), ca.MX.sym("lam_f")
         order = np.argsort(
             np.concatenate([linear, *(b.rows.ravel() for b in blocks)]), kind="stable"
         )
@@ -229,7 +231,7 @@ class NlpRows:
         place[linear] = np.arange(len(linear))
         entries = place[row].tolist(), column.tolist(), ca.DM(value)
         parts = [ca.DM.triplet(*entries, len(linear), size) @ x]
-        f = ca.dot(ca.DM(cost), x)
+        f = ca.dot(ca.DM(cost), x) + ca.dot(p, x[priced.tolist()])
         jac_rows, jac_columns, jac = [row], [column], [ca.MX(ca.DM(value))]
         places, hess = [], []
         for kernel, columns, rows, parameters in blocks:
@@ -263,7 +265,7 @@ class NlpRows:
             size, size, (unique % size).tolist(), (unique // size).tolist()
         )
         hessian = ca.MX(pattern, gather @ ca.vertcat(ca.MX(0, 1), *hess))
-        return {"x": x, "f": f, "g": g}, {
+        return {"x": x, "p": p, "f": f, "g": g}, {
             "jac_g": ca.Function("jac_g", [x, p], [g, jacobian]),
             "hess_lag": ca.Function("hess_lag", [x, p, lam_f, lam_g], [hessian]),
         }

@@ -190,18 +190,22 @@ class TimeSearch:
         """Solve from the stages' guesses in at most `most` iterations, with `raised` limits.
 
         Without these, formation limits violated at the points are added, and the NLP is solved
-        again.
+        again. The NLP of the solution `before` is used again for its own stages.
         """
         controls = self.scheme.controls
         if stages[0].guess.tau.shape[1] != controls:
             stages = [replace(s, guess=with_controls(s.guess, controls)) for s in stages]
         margin = before.margin if before else 0.0
-        if raised and before and all(map(operator.is_, stages, before.stages)):
-            return self.run(before.nlp, stages, raised, before.multipliers, margin)
         depth = 1e-6 * self.problem.scene.polygon.gyration_radius  # least violation that counts
+        nlp, multipliers = None, None
+        if before and all(map(operator.is_, stages, before.stages)):
+            # With another price the start is no solution.
+            nlp = before.nlp if raised else replace(before.nlp, max_iter=most)
+            multipliers = before.multipliers if raised else None
         while True:
             limits = raised or [LimitMisses.none(stage) for stage in stages]
-            solution = self.run(self.build(stages, most), stages, limits, None, margin)
+            nlp = nlp or self.build(stages, most)
+            solution = self.run(nlp, stages, limits, multipliers, margin)
             if raised or not solution.success:
                 return solution
             tables = [
@@ -210,13 +214,11 @@ class TimeSearch:
             stages = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
             if stages is solution.stages:
                 return solution
+            nlp, multipliers = None, None
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
-        gradient = self.price.gradient if self.price else None
-        target = Target(
-            self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
-        )
+        target = Target(self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation)
         most = {Objective.ELASTIC: 90, Objective.RELAX: 50}.get(self.goal, most)
         return build_time_nlp(stages, self.scheme, target, most)
 
@@ -244,17 +246,19 @@ class TimeSearch:
             bounded = np.isfinite(high).astype(float) - np.isfinite(low)
             on_rows = np.where(high_g > low_g, -size, 0.0)
             multipliers = {"lam_x0": size * bounded, "lam_g0": on_rows}
+        price = self.price or Price(np.zeros(5), np.zeros(5))
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
             lbx=low,
             ubx=high,
             lbg=low_g,
             ubg=high_g,
+            p=price.gradient,
             **multipliers,
         )
         stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
-        cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
+        cost -= float(price.gradient @ price.origin)
         return TimeSolution(
             [
                 replace(stage, guess=part)

@@ -166,7 +166,6 @@ class Target(NamedTuple):
     epsilon: float  # [N]: least normal force
     time_weight: float = 0.0  # [(N m)^2]: for `effort`
     relaxation: Parameter | None = None  # the relaxed limit, for `relax`
-    price: Array | None = None  # (5,): linear cost of z at the end
 
     @property
     def chained(self) -> bool:
@@ -221,7 +220,7 @@ class TimeNLP:
 def build_time_nlp(
     stages: Sequence[Stage], scheme: Scheme, target: Target, max_iter: int
 ) -> TimeNLP:
-    """Build the NLP of successive stages that end at rest."""
+    """Build the NLP of successive stages that end at rest; its parameters are prices of the end."""
     started = time.perf_counter()
     # Regularized friction holds nothing at rest.
     held = stages[0].formation.scene.has_slow_motors and not stages[0].onset
@@ -254,11 +253,9 @@ def build_time_nlp(
         total = rows.linear(1, high=np.inf)
         rows.add_entries(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         duration_row = int(total[0])
-    if target.price is not None:
-        cost[end_z] = target.price
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
-    built = rows.assemble(cost)
+    built = rows.assemble(cost, end_z)
     book(SolverStatistics(build_time=time.perf_counter() - started))
     return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
 
