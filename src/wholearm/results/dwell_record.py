@@ -199,7 +199,8 @@ class HeldMotion:
         if self.dwell is None:
             return samples
         rows, tau = held[:, None], self.dwell.at(t - self.end)
-        rest = 0.0, 0.0, tau, np.nan, np.nan  # of z', z'', torques and forces
+        # z', z'', torques and forces at rest
+        rest: tuple[float | Array, ...] = (0.0, 0.0, tau, np.nan, np.nan)
         parts = (np.where(rows, *pair) for pair in zip(rest, samples[1:], strict=True))
         return Samples(samples.z, *parts)
 

@@ -275,9 +275,9 @@ def add_stage(
 
     # Collocation of z and z' along the tangent space.
     bases = np.array([tangent_basis(formation, z) for z in guess.z[:, d // 2]])
-    f, parts = bases.shape[2], ((layout.z, layout.v), (layout.v, layout.a))
+    f, pairs = bases.shape[2], ((layout.z, layout.v), (layout.v, layout.a))
     states = np.zeros((K, 2, len(scheme.rungs), f), dtype=np.int64)
-    for k, (state, rate) in enumerate(parts):
+    for k, (state, rate) in enumerate(pairs):
         columns = {
             "start": node[:, k],
             "points": state.reshape(K, -1),
@@ -677,8 +677,8 @@ def find_bounds(
             left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
             start = starts.setdefault(stage.phase, stage.guess.nodes[0, 0])
             # Phase 2 of scene 96 of seed 1128 goes on by 1.3e-4 in all.
-            least = min(1e-3, 0.1 * abs(value - float(start[row])))
-            most = value - side * least * np.minimum(1.0, (2 * left) ** 2)
+            before = min(1e-3, 0.1 * abs(value - float(start[row])))
+            most = value - side * before * np.minimum(1.0, (2 * left) ** 2)
             if stage.until is not None and scheme.ends:
                 most[-1, -1] = side * np.inf
             (low, high)[int(side > 0)][layout.z[..., row]] = most
