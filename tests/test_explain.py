@@ -85,10 +85,13 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
     (tmp_path / "pent.toml").write_text(PENTAGON)
     problem = read_problem(str(tmp_path / "pent.toml"))
     last = problem.phases[-1:]
-    stages = Guesses(problem, last, TURNED, search(problem)).nearest.stages
-    refuse(search(problem), problem, last, stages, None)
+    alone = replace(search(problem), phases=last)
+    stages = Guesses(alone, TURNED).nearest.stages
+    refuse(alone, stages, None)
     slow = problem.with_(torque_rate_limit=rate)
-    message = why_not(lambda: require_hold_at_ends(slow, slow.phases[-1:], stages))
+    message = why_not(
+        lambda: require_hold_at_ends(replace(search(slow), phases=slow.phases[-1:]), stages)
+    )
     # With the contact that is gained there the object can be held, but not while it slows down.
     assert "none that bring it to rest at its end, x = 88.04 mm" in message
     assert "hold the object there on v1-palm v2-finger1 v0-finger2 v3-finger1" in message
@@ -151,14 +154,14 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    failed = explain_stages(search(problem), problem, problem.phases, [], None)
+    failed = explain_stages(search(problem), [], None)
     assert isinstance(failed, SolverError)
     text = str(failed)
     assert text.startswith("no plan for phases 1 and 2 (") and "found neither a plan nor" in text
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    failed = explain_stages(TimeSearch.of(slide, own), slide, slide.phases[:1], [], None)
+    failed = explain_stages(TimeSearch.of(slide, own, slide.phases[:1]), [], None)
     assert "leave out --transcription time" in str(failed)
 
 

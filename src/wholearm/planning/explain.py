@@ -62,7 +62,7 @@ from .path_domain.path_plan import Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
-from .time_domain.stage import Scheme, Stage, blend, make_formation, to_si
+from .time_domain.stage import Stage, blend, make_formation, to_si
 from .time_domain.time_motion import make_phase_motions
 
 ADVICE = 100  # iterations of the solver after which no change is tried for phases over time
@@ -396,18 +396,13 @@ def refuse_motors(
     return InfeasibleError(text, changes=changes if len(changes) == 1 else ())
 
 
-def refuse(
-    search: TimeSearch,
-    problem: Problem,
-    phases: Sequence[Phase],
-    stages: Sequence[Stage],
-    replan: Replan | None,
-) -> None:
+def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -> None:
     """Raise an InfeasibleError if no motion can begin from rest, or come to rest at the end.
 
     The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
     for `explain`.
     """
+    problem, phases = search.source, search.phases
     epsilon, last = search.problem.epsilon, stages[-1]
     stage, node, phase = stages[0], 0, phases[0]
     statics = Statics(stage.formation, stage.guess.nodes[0, 0])
@@ -464,13 +459,12 @@ def refuse(
     raise advise(InfeasibleError(text, shortfalls), parameters, list_values, replan, ADVICE)
 
 
-def require_hold_at_ends(
-    problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage]
-) -> None:
+def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
     """Raise an InfeasibleError if no torques hold the object at rest at both ends of phases.
 
     Torques may not step. The end counts if it is one point; it has to be reached by such torques.
     """
+    problem, phases = search.source, search.phases
     ends = [(phases[0], to_si(stages[0], problem), 0)]
     if stages[-1].formation.n_constraints == 4 or phases[-1].until.pins:
         ends.append((phases[-1], to_si(stages[-1], problem), -1))
@@ -505,11 +499,12 @@ def require_hold_at_ends(
             )
 
 
-def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
+def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
+    phase, epsilon = search.phases[0], search.source.epsilon
     if not margins or (best := max(margins, key=lambda margin: margin.value)).value > -0.02:
         return
-    limits = make_limits(phase.formation, problem.epsilon).limits
+    limits = make_limits(phase.formation, epsilon).limits
     limit = next(limit for limit in limits if (limit.kind, limit.part) == best[1:3])
     place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
     shortfall = Shortfall(*best[1:3], limit.text, missed * limit.scale, limit.unit, place, missed)
@@ -521,21 +516,14 @@ def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) 
 
 
 def explain_stages(
-    search: TimeSearch,
-    problem: Problem,
-    phases: Sequence[Phase],
-    short: Sequence[list[Stage]],
-    replan: Replan | None,
+    search: TimeSearch, short: Sequence[list[Stage]], replan: Replan | None
 ) -> InfeasibleError | SolverError:
     """Why phases over time have no plan, and what would change that.
 
-    Parameters
-    ----------
-    problem  in SI units
-    short    elastic solutions that violate limits, from different guesses
-    replan   None: no change is looked for
+    `short` are elastic solutions that violate limits, from different guesses. Without `replan` no
+    change is looked for.
     """
-    numbers = [phase.number for phase in phases]
+    problem, phases, numbers = search.source, search.phases, search.numbers
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         where = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until})"
@@ -545,7 +533,7 @@ def explain_stages(
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
-    lists = [list_shortfalls(problem, stages, search.scheme) for stages in short]
+    lists = [list_shortfalls(search, stages) for stages in short]
     sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
     best = sums.index(min(sums))
     stages = [to_si(stage, problem) for stage in short[best]]
@@ -572,7 +560,7 @@ def explain_stages(
         unit = _unit_of(parameter, problem.scene.scales)
         return list_beyond(parameter, parameter.value + parameter.sign * unit * solution.cost)
 
-    motions = make_phase_motions(stages, search.scheme, phases)
+    motions = make_phase_motions(stages, search.scheme)
     torques = [motion.torque for motion in motions]
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
@@ -580,11 +568,12 @@ def explain_stages(
     return explain(numbers, lists[best], motion, parameters, list_values, replan, ADVICE)
 
 
-def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
+def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfall]:
     """Violations of limits by the motion of stages in the scene's units, each where it is worst.
 
     They are looked at in SI units, at the collocation points, torques also at ends of intervals.
     """
+    problem, scheme = search.source, search.scheme
     worst, passed = dict[str, Shortfall](), 0.0
     pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
     at = np.concatenate([[0.0], scheme.points, [1.0]])

@@ -32,7 +32,6 @@ from ...geometry.path_guess import (
     is_inside,
     list_ends,
 )
-from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
@@ -82,13 +81,20 @@ class Guess(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Guesses:
-    """The guesses of phases in their order, each made when it is its turn."""
+    """The guesses of a search's phases in their order, each made when it is its turn."""
 
-    problem: Problem
-    phases: Sequence[Phase]
-    z: Array  # (5,): start
     search: TimeSearch
-    to_go: CostToGo | None = None
+    z: Array  # (5,): start
+
+    @property
+    def problem(self) -> Problem:
+        """In SI units."""
+        return self.search.source
+
+    @property
+    def phases(self) -> Sequence[Phase]:
+        """In SI units."""
+        return self.search.phases
 
     @cached_property
     def nearest(self) -> Guess:
@@ -328,9 +334,9 @@ class Guesses:
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows."""
-        if self.to_go is None:
+        if self.search.to_go is None:
             return stages
-        last, contact = stages[-1], self.to_go.phase.until.contact
+        last, contact = stages[-1], self.search.to_go.phase.until.contact
         rows = [k for k, limit in enumerate(last.formation.limits) if limit.gains(contact)]
         monitored = tuple(sorted({*last.monitored, *rows}))
         return [*stages[:-1], replace(last, apart=tuple(rows), monitored=monitored)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -26,7 +26,7 @@ from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
 from ...mechanics.sensitivity import find_slopes_at
-from ...problem.definition import Problem
+from ...problem.definition import Phase, Problem
 from ...results.trajectory import Samples
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..refinement import CostlyError, refine
@@ -108,15 +108,20 @@ class TimeSolution(NamedTuple):
 
 @dataclass
 class TimeSearch:
-    """Data common to all solves for a plan, in the scene's own units, and their statistics."""
+    """Data common to all solves for a plan, and their statistics.
 
+    All but `source`, `phases` and `to_go` is in the scene's own units.
+    """
+
+    source: Problem  # in SI units
+    phases: Sequence[Phase]  # those of the NLP
     problem: Problem
     options: PlanOptions
     scheme: Scheme
     duration: float | None  # longest duration, for the objective `margin`
     goal: Objective
     relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
-    to_go: Callable[[Array], tuple[float, Array]] | None = None  # cost-to-go and its gradient at z
+    to_go: CostToGo | None = None
     price: Price | None = None
     ample: float = math.inf  # normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
@@ -127,6 +132,7 @@ class TimeSearch:
     def of(
         problem: Problem,
         options: PlanOptions,
+        phases: Sequence[Phase] = (),
         duration: float | None = None,
         to_go: CostToGo | None = None,
         ample: float = math.inf,
@@ -134,23 +140,31 @@ class TimeSearch:
     ) -> TimeSearch:
         """A search with the arguments of `plan_phases`, in SI units."""
         scales = problem.scene.scales
-        lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
-
-        def expand(z: Array) -> tuple[float, Array]:
-            assert to_go is not None
-            value, gradient = to_go.expand(z * lengths)
-            return value / unit, gradient * lengths / unit
-
         return TimeSearch(
+            problem,
+            phases or problem.phases,
             in_own_units(problem),
             scale_options(options, scales),
             make_scheme(options.scheme, options.degree, options.degree),
             None if duration is None else duration / scales.time,
             options.goal,
-            to_go=expand if to_go else None,
+            to_go=to_go,
             ample=ample / scales.force,
             only_begins=only_begins,
         )
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the phases."""
+        return [phase.number for phase in self.phases]
+
+    def expand(self, z: Array) -> tuple[float, Price]:
+        """The cost-to-go of an end `z`, (5,), to first order; a `WholearmError` without a plan."""
+        assert self.to_go is not None
+        scales = self.source.scene.scales
+        lengths, unit = unit_lengths(scales), unit_of(self.goal, scales)
+        value, gradient = self.to_go.expand(z * lengths)
+        return value / unit, Price(gradient * lengths / unit, z)
 
     def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> TimeSearch:
         """The same search with another objective.

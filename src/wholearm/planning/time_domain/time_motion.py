@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,6 @@ from ...mechanics.dynamics import (
     move_least,
     split_forces,
 )
-from ...problem.definition import Phase
 from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
@@ -234,15 +234,11 @@ class TimeMotion:
         return Samples(*(np.concatenate(tables)[inverse] for tables in zip(*parts, strict=True)))
 
 
-def make_phase_motions(
-    stages: Sequence[Stage], scheme: Scheme, phases: Sequence[Phase]
-) -> list[TimeMotion]:
+def make_phase_motions(stages: Sequence[Stage], scheme: Scheme) -> list[TimeMotion]:
     """The motion of each phase from the stages' guesses."""
-    pairs = list(zip(make_motions(stages, scheme), stages, strict=True))
-    return [
-        TimeMotion([motion for motion, stage in pairs if stage.phase == phase.index])
-        for phase in phases
-    ]
+    pairs = zip(stages, make_motions(stages, scheme), strict=True)
+    groups = groupby(pairs, key=lambda pair: pair[0].phase)
+    return [TimeMotion([motion for _, motion in group]) for _, group in groups]
 
 
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:

@@ -43,7 +43,7 @@ from .mode_search import (
     list_neighbours,
     sign_sequence,
 )
-from .solution import COSTLY, Price, TimeSearch, TimeSolution, keep_within, refine_stages
+from .solution import COSTLY, TimeSearch, TimeSolution, keep_within, refine_stages
 from .stage import (
     Scheme,
     Stage,
@@ -105,8 +105,8 @@ def plan_phases(
     """
     from ..explain import change_limit, refuse
 
-    search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
-    guesses = Guesses(problem, phases, z, search, to_go)
+    search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
+    guesses = Guesses(search, z)
     named_solution = _resume(search, guesses, begun) if begun else None
     stages = list_stages(fastest)
 
@@ -119,9 +119,7 @@ def plan_phases(
     if named_solution is None and free:
         guess = guesses.along(free)
         if problem.scene.has_slow_motors or problem.scene.control_period:
-            named_solution = change_torques(
-                search, guess, problem, phases, stages if pinned else []
-            )
+            named_solution = change_torques(search, guess, stages if pinned else [])
         else:
             named_solution = solve_guesses(search, [guess])
     for guess in guesses.list_given() if named_solution is None else ():
@@ -136,18 +134,17 @@ def plan_phases(
         named_solution = solve_guesses(
             search,
             listed,
-            lambda: refuse(search, problem, phases, guesses.nearest.stages, explanation),
+            lambda: refuse(search, guesses.nearest.stages, explanation),
         )
     if named_solution is None and _can_last(search, stages):
-        numbers = name_phases([phase.number for phase in phases])
         raise SolverError(
-            f"no plan for {numbers}: the solver did not converge for the largest margin, although "
-            "the motion of least time keeps all limits; try another duration (--duration) or "
-            "number of intervals per phase (--time-intervals)"
+            f"no plan for {name_phases(search.numbers)}: the solver did not converge for the "
+            "largest margin, although the motion of least time keeps all limits; try another "
+            "duration (--duration) or number of intervals per phase (--time-intervals)"
         )
     if named_solution is None:
         named_solution = _solve_elastic(search, guesses, explanation)
-    plans = list_plans(problem, search, phases, *named_solution)
+    plans = list_plans(search, *named_solution)
     if problem.scene.control_period:
         kept = "error", "sequences", "complete"
         return [
@@ -157,13 +154,7 @@ def plan_phases(
     return plans
 
 
-def change_torques(
-    search: TimeSearch,
-    guess: Guess,
-    problem: Problem,
-    phases: Sequence[Phase],
-    fastest: Sequence[Stage],
-) -> _Named:
+def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> _Named:
     """The plan with the torques that motors and control periods allow, from one with free torques.
 
     It keeps the modes of that, and for `margin` ends where the stages `fastest` do, if any.
@@ -174,21 +165,17 @@ def change_torques(
         guess = guess._replace(stages=[*guess.stages[:-1], last])
     if search.to_go is not None:
         with suppress(WholearmError):
-            end = last.guess.nodes[-1, 0]
-            search = replace(search, price=Price(search.to_go(end)[1], end))
+            search = replace(search, price=search.expand(last.guess.nodes[-1, 0])[1])
     stages, solution = drop_stops(guess.stages), None
-    if problem.scene.has_slow_motors:
-        solution = reach_motors(search, stages, problem, phases)
-    if problem.scene.control_period:
-        stages = solution.stages if solution else stages
-        solution = hold_torques(search, stages, problem, phases)
+    if search.source.scene.has_slow_motors:
+        solution = reach_motors(search, stages)
+    if search.source.scene.control_period:
+        solution = hold_torques(search, solution.stages if solution else stages)
     assert solution is not None
     return solution, guess.name
 
 
-def reach_motors(
-    search: TimeSearch, free: Sequence[Stage], problem: Problem, phases: Sequence[Phase]
-) -> TimeSolution:
+def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     """The plan with the limits of motors from one with free torques, by continuation in these.
 
     Case: phases 6 and 7 of query 0 have a plan from motors 4 times as quick alone.
@@ -199,7 +186,7 @@ def reach_motors(
     """
     from ..explain import refuse_motors, require_hold_at_ends
 
-    require_hold_at_ends(problem, phases, free)
+    require_hold_at_ends(search, free)
     plans = list[tuple[float, TimeSearch, TimeSolution]]()
     stages = [stage.stretch(1.3) for stage in adapt_ends(free, search)]
 
@@ -230,8 +217,9 @@ def reach_motors(
             break
     else:
         factor = math.inf
-    quick_scene = problem.scene.quicken(factor) if math.isfinite(factor) else None
-    raise refuse_motors(problem.scene, quick_scene, [phase.number for phase in phases])
+    scene = search.source.scene
+    quick_scene = scene.quicken(factor) if math.isfinite(factor) else None
+    raise refuse_motors(scene, quick_scene, search.numbers)
 
 
 def try_phases(
@@ -254,8 +242,8 @@ def try_phases(
     to_go         cost of what follows, for the choice of the end
     """
     rough = replace(options, mode_search=False)
-    search = TimeSearch.of(problem, rough, to_go=to_go, only_begins=True)
-    guesses = Guesses(problem, phases, z, search, to_go)
+    search = TimeSearch.of(problem, rough, phases, to_go=to_go, only_begins=True)
+    guesses = Guesses(search, z)
     listed: Iterable[Guess] = guesses.every(goal)
     if single_guess:
         # The nearest end is another guess than a straight path that limits exclude.
@@ -269,7 +257,7 @@ def try_phases(
         solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
         if solution.success:
             search, solution = choose_end(search, solution)
-            first, *others = list_plans(problem, search, phases, solution, guess.name)
+            first, *others = list_plans(search, solution, guess.name)
             return [first._replace(complete=not options.mode_search), *others]
     return None
 
@@ -368,9 +356,7 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     return solution
 
 
-def hold_torques(
-    search: TimeSearch, free: list[Stage], problem: Problem, phases: Sequence[Phase]
-) -> TimeSolution:
+def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
     """The plan with torques held over control periods, from one with free torques.
 
     How many periods each phase takes follows from the motion with as many periods of one duration
@@ -422,8 +408,9 @@ def hold_torques(
         return solution
     # One duration each: six take two minutes more for phase 5 of query 1, and find nothing either.
     share = next((part for part in (0.5, 0.2) if hold(part * scene.control_period, 1)), None)
-    quick = replace(problem.scene, control_period=share * scene.control_period) if share else None
-    raise refuse_motors(problem.scene, quick, [phase.number for phase in phases])
+    scene = search.source.scene
+    quick = replace(scene, control_period=share * scene.control_period) if share else None
+    raise refuse_motors(scene, quick, search.numbers)
 
 
 def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
@@ -498,19 +485,19 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
 
     Also returns the search with the price of the last end.
     """
-    best, least, to_go = (search, solution), None, search.to_go
-    if to_go is None:
+    best, least = (search, solution), None
+    if search.to_go is None:
         return best
     for _ in range(4):  # most expansions of the cost-to-go
         try:
-            value, gradient = to_go(solution.end)
+            value, price = search.expand(solution.end)
         except WholearmError:
             break
         total = solution.cost - search.charge(solution.end) + value
         if least is not None and total > least - 1e-4 * abs(least):
             break
         least, best = total, (search, solution)
-        search = replace(search, price=Price(gradient, solution.end))
+        search = replace(search, price=price)
         solution = search.solve(solution.stages, solution)
         if not solution.success:
             break
@@ -558,15 +545,21 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
     Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
     """
-    scaled_phases, every = search.problem.phases, guesses.problem.phases
-    if not any(_set_free(phase) is not phase for phase in guesses.phases):
+    scaled_phases = search.problem.phases
+    if not any(_set_free(phase) is not phase for phase in search.phases):
         return
-    problem = replace(guesses.problem, phases=tuple(map(_set_free, every)))
-    phases = [problem.phases[phase.index] for phase in guesses.phases]
+    problem = replace(search.source, phases=tuple(map(_set_free, search.source.phases)))
+    phases = [problem.phases[phase.index] for phase in search.phases]
     free_search = replace(
-        search, problem=in_own_units(problem), only_begins=True, to_go=None, price=None
+        search,
+        source=problem,
+        phases=phases,
+        problem=in_own_units(problem),
+        only_begins=True,
+        to_go=None,
+        price=None,
     )
-    coarse = solve_guesses(free_search, Guesses(problem, phases, guesses.z, free_search).every())
+    coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
     if coarse is None:
         return
     stages = [
@@ -589,11 +582,11 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     """Plan from motions of least violation, or the error that says why there is none."""
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
-    problem, scheme, short = guesses.problem, search.scheme, list[list[Stage]]()
+    short = list[list[Stage]]()
     soft = search.aiming(Objective.ELASTIC)
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
         elastic = soft.solve(guess.stages)
-        if elastic.success and not list_shortfalls(problem, elastic.stages, scheme):
+        if elastic.success and not list_shortfalls(search, elastic.stages):
             # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
             named_solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if named_solution is not None:
@@ -601,37 +594,29 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
         elif elastic.success:
             short.append(elastic.stages)
     if not short:
-        refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
-    raise explain_stages(search, problem, guesses.phases, short, replan)
+        refuse_paths(search, [margin for margin, _ in guesses.paths])
+    raise explain_stages(search, short, replan)
 
 
 def list_plans(
-    problem: Problem,
-    search: TimeSearch,
-    phases: Sequence[Phase],
-    solution: TimeSolution,
-    attempt: str,
+    search: TimeSearch, solution: TimeSolution, attempt: str
 ) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase."""
-
-    def evaluate(solution: TimeSolution) -> list[tuple[TimeMotion, float]]:
-        """Motion and share of the objective of each phase."""
-        stages, scales = [to_si(stage, problem) for stage in solution.stages], problem.scene.scales
-        motions = make_phase_motions(stages, search.scheme, phases)
+    problem, plans = search.source, list[PhasePlan[TimeMotion]]()
+    scales, first = problem.scene.scales, search.tried
+    stages = [to_si(stage, problem) for stage in solution.stages]
+    motions = make_phase_motions(stages, search.scheme)
+    for phase, motion in zip(search.phases, motions, strict=True):
+        value = motion.duration
         if search.goal is Objective.MARGIN:
             value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
-            return [(motion, value) for motion in motions]
-        if search.goal is Objective.TIME:
-            return [(motion, motion.duration) for motion in motions]
-        weight = search.options.time_weight * scales.torque**2
-        return [(m, weight * m.duration + m.torque.integrate_squares()) for m in motions]
-
-    plans, tried = list[PhasePlan[TimeMotion]](), search.tried
-    for phase, (motion, value) in zip(phases, evaluate(solution), strict=True):
-        stages = [stage for stage in solution.stages if stage.phase == phase.index]
-        plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=stages)
+        elif search.goal is Objective.EFFORT:
+            weight = search.options.time_weight * scales.torque**2
+            value = weight * motion.duration + motion.torque.integrate_squares()
+        of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
+        plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
-    plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
+    plans[0] = plans[0]._replace(sequences=first.sequences, complete=first.complete)
     return plans
 
 
