@@ -339,7 +339,6 @@ class TimeIterate:
     change: float = 0.01  # of the cost by the last finer intervals, relative; at first a guess
     least: float = math.nan  # cost of the first solution on these intervals
     refined: int = 0  # iterates with finer intervals so far
-    before: TimeIterate | None = None  # the last one with a solution
 
     def solve(self) -> TimeIterate:
         """The solution on these stages."""
@@ -358,40 +357,25 @@ class TimeIterate:
             change = abs(solution.cost - old.cost) / self.search.measure(solution.cost)
             least = solution.cost
         solved = replace(self, solution=solution, stages=solution.stages, change=change)
-        return replace(solved, least=least, is_solved=True, before=None)
+        return replace(solved, least=least, is_solved=True)
 
     def adapt(self) -> TimeIterate | None:
         """With finer intervals, raised limits and those of the formation that are violated."""
         if self.violation <= 1 and not self.is_coarse:
             return None
-        return self._bisect(self.halvings, self.raised)
-
-    def restart(self) -> TimeIterate | None:
-        """From the last solution, without raised limits; once.
-
-        These may leave nothing where shorter intervals miss less.
-        """
-        if self.before is None:
-            return None
-        times = [(ratios > 1).astype(np.int64) for ratios in self.before.over]
-        none = [LimitMisses.none(stage) for stage in self.before.stages]
-        return replace(self.before._bisect(times, none), before=None)
-
-    def _bisect(
-        self, times: Sequence[NDArray[np.int64]], raised: Sequence[LimitMisses]
-    ) -> TimeIterate:
-        """On intervals that are halved so many times, with limits raised by what is missed."""
+        triples = zip(self.raised, self.misses, self.halvings, strict=True)
         return replace(
             self,
-            stages=bisect_intervals(self.monitored, self.search.scheme, times),
+            stages=bisect_intervals(self.monitored, self.search.scheme, self.halvings),
             raised=[
-                amounts.add(miss, SETTINGS.over).halve(mine)
-                for amounts, miss, mine in zip(raised, self.misses, times, strict=True)
+                amounts.add(miss, SETTINGS.over).halve(mine) for amounts, miss, mine in triples
             ],
             is_solved=False,
-            refined=self.refined + any(halvings.any() for halvings in times),
-            before=self,
+            refined=self.refined + self.is_coarse,
         )
+
+    def restart(self) -> None:
+        """Without a solution there is no other iterate."""
 
     @cached_property
     def motions(self) -> list[StageMotion]:
