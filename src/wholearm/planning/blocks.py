@@ -110,11 +110,6 @@ class Planning:
         """Longest duration of some phases in all [s], for the objective `margin`."""
         return sum(self.allowed[phase.index] for phase in phases) if self.allowed else None
 
-    def find_block(self, number: int) -> int:
-        """Index of the block with the phase of a number, counted from 1."""
-        ends = [block.phases[-1].number for block in self.blocks]
-        return next(k for k, end in enumerate(ends) if number <= end)
-
     def find_before(self, phases: Sequence[Phase]) -> BlockPlan | None:
         """The planned block that ends where some phases begin."""
         index = phases[0].index
@@ -131,16 +126,14 @@ def plan_blocks(
     with name_source(problem.source):
         require_steps(problem, options)
     planning = Planning(problem, curves, options, ())
-    if options.goal is Objective.MARGIN:
-        first = replace(
-            planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
-        )
-        least = plan_each(_begin_each(first, report), report).plans
-        times = [plan.motion.duration for plan in least]
-        longest = 2 * sum(times) if options.duration is None else options.duration
-        planning = replace(planning, allowed=share_duration(times, longest), least=least)
-        return plan_each(planning, report)
-    return plan_each(_begin_each(planning, report), report)
+    if options.goal is not Objective.MARGIN:
+        return plan_each(_begin_each(planning, report), report)
+    fast = replace(options, objective=Objective.TIME, duration=None)
+    first = replace(planning, options=fast, ahead=False)
+    least = plan_each(_begin_each(first, report), report).plans
+    times = [plan.motion.duration for plan in least]
+    longest = 2 * sum(times) if options.duration is None else options.duration
+    return plan_each(replace(planning, allowed=share_duration(times, longest), least=least), report)
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
@@ -497,18 +490,6 @@ class ImpactSequence:
         numbers = [phase.number for phase in self.phases]
         curves = self.continuous_curves
         return [*plan_curves(curves, epsilon, options, numbers, duration, **others)]
-
-    def plan_part(
-        self,
-        epsilon: float,
-        start: int,
-        stop: int,
-        z: Array,
-        options: PlanOptions,
-        duration: float | None,
-    ) -> Plans:
-        """Plan phases `start` to `stop`, from rest at their curve's start `z`: a `PlanPart`."""
-        return self.part(start, stop).plan(epsilon, options, duration, explained=False)
 
     def list_impacts(self, plans: Plans) -> list[Transition]:
         """The impacts, with the speeds that plans of the phases pass them at."""

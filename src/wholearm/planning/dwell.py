@@ -170,7 +170,11 @@ class DwellEnd(NamedTuple):
 
 def settle_plans(problem: Problem, plans: Plans) -> Plans:
     """The plans with the dwells that the problem asks for where phases come to rest."""
-    places = find_places(problem, plans)
+    places = list[Standstill | None]()  # where phases come to rest
+    for phase, plan in zip(problem.phases, plans, strict=True):
+        z, v = end_of(plan)
+        place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
+        places.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
     if problem.settle_share:
         ends = share_time(problem, plans, places)
     else:
@@ -181,16 +185,6 @@ def settle_plans(problem: Problem, plans: Plans) -> Plans:
         plan if end is None else plan._replace(settling=_describe(problem, phase, end))
         for plan, phase, end in triples
     ]
-
-
-def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
-    """Where phases come to rest; None for those that do not."""
-    standstills = list[Standstill | None]()
-    for phase, plan in zip(problem.phases, plans, strict=True):
-        z, v = end_of(plan)
-        place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
-        standstills.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
-    return standstills
 
 
 def find_ends(

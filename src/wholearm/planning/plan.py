@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
+from ..common.arrays import Array
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
@@ -34,7 +35,7 @@ from .nlp import Ledger, charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import Task, plan_curves
-from .phase_plan import PlanPart, combine, plan_stops
+from .phase_plan import PlanPart, Plans, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
 if TYPE_CHECKING:
@@ -138,12 +139,8 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         if options.certify:
             report("bounding the least time from below")
             certificate = certify(planning)
-        phases = _list_phases(planning, ledger, unique)
-        if certificate is not None:
-            gaps = certificate.gaps
-            phases = tuple(
-                phase._replace(error=gaps.get(phase.number, phase.error)) for phase in phases
-            )
+        gaps = certificate.gaps if certificate else {}
+        phases = _list_phases(planning, ledger, unique, gaps)
         plan = Plan(
             problem,
             options,
@@ -174,7 +171,7 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
 
 
 def _list_phases(
-    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness]
+    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness], gaps: Mapping[int, float]
 ) -> tuple[PlannedPhase, ...]:
     return tuple(
         PlannedPhase(
@@ -187,7 +184,7 @@ def _list_phases(
             plan.sequences,
             plan.complete,
             plan.attempt,
-            plan.error,
+            gaps.get(phase.number, plan.error),
             *unique[phase.index],
             plan.settling,
             None if math.isnan(plan.unheld) else plan.unheld,
@@ -209,7 +206,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             plan_part = plan_parts_of(planning.problem, block.phases)
         else:
             impacts = block.chain.list_impacts(block.plans)
-            plan_part = partial(block.chain.plan_part, planning.problem.epsilon)
+            plan_part = partial(_plan_part, block.chain, planning.problem.epsilon)
         first = block.phases[0].index
         stops = [
             0,
@@ -226,6 +223,13 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
                     impact = impact._replace(saves=_find_saving(planning, block, bounds, plan_part))
             transitions.append(impact)
     return transitions
+
+
+def _plan_part(
+    chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *others: Any
+) -> Plans:
+    """Plan phases `start` to `stop` of a chain, from rest at their curve's start: a `PlanPart`."""
+    return chain.part(start, stop).plan(epsilon, *others, explained=False)
 
 
 def _find_saving(

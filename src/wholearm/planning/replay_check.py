@@ -126,8 +126,8 @@ def _improve(
     `bench queries`. Then with a larger epsilon, as at a reversal a replay may stick for an instant,
     with another force: least effort of leg 22 of seed 7.
     """
-    index, others = planning.find_block(number), list[Planning]()
-    block = planning.blocks[index]
+    others, pairs = list[Planning](), enumerate(planning.blocks)
+    index, block = next(pair for pair in pairs if number <= pair[1].phases[-1].number)
     # Torques where blocks meet depend on both where they may not step.
     reach = 1 if planning.problem.scene.has_slow_motors else 0
     near = range(index - reach, index + reach + 1)

@@ -177,10 +177,6 @@ class TimeSearch:
         other = replace(self, duration=None, to_go=None, price=None)
         return replace(other, goal=goal, relaxation=relaxation, scheme=scheme)
 
-    def charge(self, z: Array) -> float:
-        """Price of an end at `z`, shape (5,)."""
-        return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
-
     def has_ample(self, solution: TimeSolution) -> bool:
         """Whether the objective `margin` is saturated."""
         return self.goal is Objective.MARGIN and solution.margin > self.most_margin

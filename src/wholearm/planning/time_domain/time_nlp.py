@@ -40,7 +40,6 @@ from ...geometry.curve import find_tied, find_vanishing, tangent_basis
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...problem.definition import Until
-from ...scene.model import Scene
 from ..nlp import (
     Columns,
     Indices,
@@ -728,12 +727,6 @@ def _free_equal(stage: Stage, rows: StageRows, low_x: Array, low_g: Array) -> No
                 low_g[indices[0, 0]] = -np.inf
 
 
-def build_applied(scene: Scene, tau: Expression, sigma: Expression) -> Expression:
-    """Applied forces, torques, and dry friction of the joints, shape (5,)."""
-    friction = ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-    return ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
-
-
 @share
 def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
@@ -753,7 +746,8 @@ def point_kernel(formation: Formation, controls: int, homotopy: bool = False) ->
     if rolls:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
     push = build_force_rows(formation, P, A_t, Xi).T @ s.forces
-    applied = push + build_applied(scene, ca.reshape(s.tau, 2, controls) @ p.shares, sigma)
+    at_joints = ca.reshape(s.tau, 2, controls) @ p.shares - ca.DM(scene.dry[3:]) * sigma
+    applied = push + ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, at_joints)
     return build_kernel(
         s,
         p,

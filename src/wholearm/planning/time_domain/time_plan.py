@@ -413,7 +413,10 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
 
 
 def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages without the last periods of phases whose duration has vanished; none if none has."""
+    """Stages without the last periods of phases whose duration has vanished; none if none has.
+
+    Case: `triangle.toml` at 10 ms takes 1.5 % longer without it.
+    """
     dropped, changed = list(stages), False
     for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
         last = coming is None or coming.phase != stage.phase
@@ -492,7 +495,9 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
             value, price = search.expand(solution.end)
         except WholearmError:
             break
-        total = solution.cost - search.charge(solution.end) + value
+        total = solution.cost + value
+        if search.price is not None:
+            total -= float(search.price.gradient @ (solution.end - search.price.origin))
         if least is not None and total > least - 1e-4 * abs(least):
             break
         least, best = total, (search, solution)
