@@ -90,16 +90,6 @@ class Guesses:
     search: TimeSearch
     z: Array  # (5,): start
 
-    @property
-    def problem(self) -> Problem:
-        """In SI units."""
-        return self.search.source
-
-    @property
-    def phases(self) -> Sequence[Phase]:
-        """In SI units."""
-        return self.search.phases
-
     @cached_property
     def nearest(self) -> Guess:
         """To the nearest end of each phase."""
@@ -110,12 +100,12 @@ class Guesses:
 
         The motion is a cubic spline in time through the poses.
         """
-        if not all(phase.guess for phase in self.phases):
+        if not all(phase.guess for phase in self.search.phases):
             return []
         from scipy.interpolate import CubicSpline  # its import takes 0.3 s
 
-        scales, t, z = self.problem.scene.scales, [0.0], [self.z]
-        for phase in self.phases:
+        scales, t, z = self.search.source.scene.scales, [0.0], [self.z]
+        for phase in self.search.phases:
             start, slip = t[-1], phase.formation.evaluate_slip(z[-1][None])[0]
             for mode in phase.guess or ():
                 place = z[-1].copy()
@@ -138,9 +128,9 @@ class Guesses:
 
     def _follow_given(self, path: Callable[..., Any], finer: int) -> list[Stage]:
         """Stages in given modes along a path z(t) in own units, on more intervals than usual."""
-        scales, scheme = self.problem.scene.scales, self.search.scheme
+        scales, scheme = self.search.source.scene.scales, self.search.scheme
         stages, begin = list[Stage](), 0.0
-        for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
+        for stage, phase in zip(join_modes(self.nearest.stages), self.search.phases, strict=True):
             modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
             intervals, span = finer * stage.intervals, modes[-1].t / scales.time
 
@@ -171,7 +161,7 @@ class Guesses:
                     over_time = drop(over_time, k) or over_time
             over_time = link([stage.move_to(problem.scene) for stage in over_time])
             return self.resume("the plan with free torques", over_time)
-        units, scheme = unit_points(self.problem.scene.scales), self.search.scheme
+        units, scheme = unit_points(self.search.source.scene.scales), self.search.scheme
         controls, stages = np.linspace(0.0, 1.0, scheme.controls), list[Stage]()
         for stage, plan in zip(join_modes(self.nearest.stages), plans, strict=True):
             motion = plan.motion
@@ -180,7 +170,7 @@ class Guesses:
             for start, stop, directions in motion.spans:
                 span = stop - start
                 count = max(LEAST_INTERVALS, round(span / motion.duration * stage.intervals))
-                if period := self.problem.scene.control_period:
+                if period := self.search.source.scene.control_period:
                     count = max(count, math.ceil(span / period))
                 breaks = np.linspace(0.0, 1.0, count + 1)
                 inner = (breaks[:-1, None] + x / count for x in (scheme.points, controls))
@@ -223,7 +213,7 @@ class Guesses:
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal) if self._is_planar() else None
-        margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
+        margin = find_margin(outline, self.search.source.epsilon, paced=True) if outline else None
         if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
             return None
         return self._follow("a motion straight to the end", outline, margin.profile)
@@ -233,7 +223,9 @@ class Guesses:
         """Straight paths to the ends of a single phase, those first that keep limits most."""
         goals = self._list_goals() if self._is_planar() else []
         outlines = [guess for goal in goals if (guess := self._connect(goal))]
-        paths = [(find_margin(outline, self.problem.epsilon), outline) for outline in outlines]
+        paths = [
+            (find_margin(outline, self.search.source.epsilon), outline) for outline in outlines
+        ]
 
         def rank(path: tuple[PathMargin, PathGuess]) -> tuple[float, float]:
             """Feasible paths by their length, others by their margin."""
@@ -249,13 +241,13 @@ class Guesses:
 
     def _is_planar(self) -> bool:
         """Whether there is a single phase, with two freedoms, that does not end by a release."""
-        phase, *others = self.phases
+        phase, *others = self.search.phases
         free = tangent_basis(phase.formation, self.z).shape[1]
         return free == 2 and not (others or phase.until.is_release)
 
     def _connect(self, goal: Array) -> PathGuess | None:
         """The straight path to an end; None if it is obstructed."""
-        formation = self.phases[0].formation
+        formation = self.search.phases[0].formation
         outline = connect(formation, self.z, goal)
         moves = np.diff(outline.z, axis=0).any(axis=1).all()
         free = formation.evaluate_limits(outline.z).min() > -formation.scene.touching
@@ -279,8 +271,8 @@ class Guesses:
         `goal`: the end of the first, straight one; without it, that of a phase with pins.
         """
         given = goal is not None
-        if not given and self._is_planar() and self.phases[0].until.pins:
-            goal = find_end(self.phases[0], self.z)
+        if not given and self._is_planar() and self.search.phases[0].until.pins:
+            goal = find_end(self.search.phases[0], self.z)
         straight = None if goal is None else self.straight(goal)
         if straight is not None:
             yield straight
@@ -293,7 +285,7 @@ class Guesses:
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
-        (phase,) = self.phases
+        (phase,) = self.search.phases
         formation, nearest = phase.formation, find_end(phase, self.z)
         metric = np.sqrt(metric_weights(formation.scene))
         step = 0.15 * float(np.linalg.norm((nearest - self.z) * metric))  # over that path
@@ -333,7 +325,13 @@ class Guesses:
         profile: PathSpeed | None = None,
         falls: float = FALLS,
     ) -> list[Stage]:
-        arguments = self.problem, self.phases, self.z, self.search.scheme, self.search.options
+        arguments = (
+            self.search.source,
+            self.search.phases,
+            self.z,
+            self.search.scheme,
+            self.search.options,
+        )
         return self._leave_room(guess_stages(*arguments, pieces, profile, falls))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:

@@ -86,6 +86,7 @@ class TimeSolution(NamedTuple):
     nlp: TimeNLP
     multipliers: Multipliers
     error: float = math.nan  # estimated gain of better torques, over the cost; not always known
+    attempt: str = ""  # name of the guess that it is from
 
     @property
     def end(self) -> Array:
@@ -405,17 +406,91 @@ class TimeIterate:
 
     @cached_property
     def gains(self) -> list[Array]:
-        """Relative gain of torques of any shape in each interval of each stage."""
-        return _find_gains(self.search, self.solution, self.motions, self.change)
+        """Relative gain of torques of any shape in each interval of each stage, shape (K,) each.
+
+        Zero for held torques. For rate-limited ones it is the relative change of the cost by the
+        last finer intervals, distributed by the second differences of the control points.
+        """
+        search, solution = self.search, self.solution
+        stages, epsilon = solution.stages, search.problem.epsilon
+        if stages[0].periods:
+            return [np.zeros(stage.intervals) for stage in stages]
+        size = search.measure(solution.cost)
+        if search.problem.scene.has_slow_motors:
+            limit, shares = search.problem.scene.torque_limit, list[Array]()
+            for part in (stage.guess for stage in stages):
+                bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
+                shares.append(part.duration * part.fractions * bends)
+            return [share * (self.change / max(_sum(shares), 1e-300)) for share in shares]
+        square, gains = float(search.goal is Objective.EFFORT), list[Array]()
+        x, weights = np.polynomial.legendre.leggauss(7)
+        x = (x + 1) / 2
+        for rows, stage, motion in zip(solution.nlp.rows_of, stages, self.motions, strict=True):
+            # Costates of z and z' at the start of each interval.
+            lam = solution.multipliers["lam_g0"][rows.states].sum(axis=2)
+            costate = np.einsum("kdf,ksf->ksd", rows.bases, lam)
+            # The Hamiltonian at the Gauss points of the intervals is minimised over the torques.
+            lengths = np.diff(motion.breaks)
+            t = motion.breaks[:-1, None] + lengths[:, None] * x
+            response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
+            here = MotionResponse(*(part[:n] for part in response))
+            switching = np.einsum("kd,kdj->kj", costate[:, 1], response.a_by_torque[n:])
+            switching = _interpolate(motion.breaks, switching, int(stage.opens), x)
+            slope = 2 * square * here.y[:, -4:-2] - switching
+            limits = make_limits(stage.formation, epsilon)
+            values = here.y @ limits.rows.T
+            values[:, limits.of(PRESS)] -= solution.margin
+            side_rows, signs, _ = limits.sides
+            scales = limits.scales[side_rows]
+            slack = np.maximum(limits.find_slack(values) / scales, 0.0)
+            by_torque = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)
+            sides = by_torque[:, side_rows] * (signs / scales)[:, None]
+            held = _find_held(stage, here, stage.guess.places(x))
+            sides = np.concatenate([sides, held, -held], axis=1)
+            slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
+            least = find_least(slope, square, sides, slack).reshape(t.shape)
+            defects = np.abs(np.einsum("ksd,ksd->k", costate, motion.defects))
+            gains.append((defects - least @ weights / 2 * lengths) / size)
+        return gains
 
     @cached_property
     def halvings(self) -> list[NDArray[np.int64]]:
-        """How often to halve each interval of each stage."""
-        times = list[NDArray[np.int64]]()
-        if self.refined < SETTINGS.refinements:
-            args = self.search, self.solution, self.motions, self.misses, self.gains
-            times = _choose_halvings(*args)
-        return times or [np.zeros(stage.intervals, dtype=np.int64) for stage in self.stages]
+        """How often to halve each interval of each stage.
+
+        Gains do not count with a given number of intervals.
+        """
+        search, solution = self.search, self.solution
+        none = [np.zeros(stage.intervals, dtype=np.int64) for stage in self.stages]
+        options, phases = search.options, len({stage.phase for stage in solution.stages})
+        share = max(1.0, math.sqrt(DEFAULT_ACCURACY / options.accuracy))
+        most = math.ceil(SETTINGS.intervals * share) * phases
+        intervals = sum(stage.intervals for stage in solution.stages)
+        if self.refined >= SETTINGS.refinements or intervals >= most:
+            return none
+        on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+        nlp, prices, times = solution.nlp, list[Array](), list[NDArray[np.int64]]()
+        for rows, miss, motion in zip(nlp.rows_of, self.misses, self.motions, strict=True):
+            # Relative cost of raising limits by their misses, by multipliers.
+            price = np.zeros_like(miss.held)
+            for side, on_rows, indices in rows.parts:
+                price[:, side] += (on_g if on_rows else on_x)[indices].sum(axis=1)
+            cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
+            prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+            # Errors of collocation decrease with the scheme's order, costs with the third one.
+            dear = np.maximum(prices[-1] / SETTINGS.dear, 1.0)
+            error = np.maximum(np.abs(motion.defects).max(axis=(1, 2)) / SETTINGS.defect, 1.0)
+            wanted = np.ceil(np.maximum(np.log2(dear) / 3, np.log2(error) / search.scheme.order))
+            times.append(np.clip(wanted, 0, SETTINGS.at_once).astype(np.int64))
+        shares = [gain + price for gain, price in zip(self.gains, prices, strict=True)]
+        if options.time_intervals is None and _sum(shares) > options.accuracy:
+            left = SETTINGS.spare * options.accuracy
+            if search.problem.scene.has_slow_motors:
+                # Their gains are those of the last iterate, and not of the next one.
+                left = max(left, 0.5 * _sum(shares))
+            more = spread_halvings(shares, left)
+            times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
+        count = sum(int((2**mine).sum()) for mine in times)
+        return times if count <= most else [np.minimum(mine, 1) for mine in times]
 
     @property
     def is_coarse(self) -> bool:
@@ -565,95 +640,6 @@ def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Arr
                 change = change + c @ edges.T - epsilon * edges.sum(axis=1)
             total[:, forces] += ranges[name] * np.abs(change)
     return np.asarray(total[:, sides] / limits.scales[sides])
-
-
-def _find_gains(
-    search: TimeSearch, solution: TimeSolution, motions: Sequence[StageMotion], change: float
-) -> list[Array]:
-    """Relative gain of torques of any shape in each interval, shape (K,) each.
-
-    Zero for held torques. For rate-limited ones it is the relative `change` of the cost by the last
-    finer intervals, distributed by the second differences of the control points.
-    """
-    stages, epsilon = solution.stages, search.problem.epsilon
-    if stages[0].periods:
-        return [np.zeros(stage.intervals) for stage in stages]
-    size = search.measure(solution.cost)
-    if search.problem.scene.has_slow_motors:
-        limit, shares = search.problem.scene.torque_limit, list[Array]()
-        for part in (stage.guess for stage in stages):
-            bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
-            shares.append(part.duration * part.fractions * bends)
-        return [share * (change / max(_sum(shares), 1e-300)) for share in shares]
-    square, gains = float(search.goal is Objective.EFFORT), list[Array]()
-    x, weights = np.polynomial.legendre.leggauss(7)
-    x = (x + 1) / 2
-    for rows, stage, motion in zip(solution.nlp.rows_of, stages, motions, strict=True):
-        # Costates of z and z' at the start of each interval.
-        lam = solution.multipliers["lam_g0"][rows.states].sum(axis=2)
-        costate = np.einsum("kdf,ksf->ksd", rows.bases, lam)
-        # The Hamiltonian at the Gauss points of the intervals is minimised over the torques.
-        lengths = np.diff(motion.breaks)
-        t = motion.breaks[:-1, None] + lengths[:, None] * x
-        response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
-        here = MotionResponse(*(part[:n] for part in response))
-        switching = np.einsum("kd,kdj->kj", costate[:, 1], response.a_by_torque[n:])
-        switching = _interpolate(motion.breaks, switching, int(stage.opens), x)
-        slope = 2 * square * here.y[:, -4:-2] - switching
-        limits = make_limits(stage.formation, epsilon)
-        values = here.y @ limits.rows.T
-        values[:, limits.of(PRESS)] -= solution.margin
-        side_rows, signs, _ = limits.sides
-        scales = limits.scales[side_rows]
-        slack = np.maximum(limits.find_slack(values) / scales, 0.0)
-        by_torque = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)
-        sides = by_torque[:, side_rows] * (signs / scales)[:, None]
-        held = _find_held(stage, here, stage.guess.places(x))
-        sides = np.concatenate([sides, held, -held], axis=1)
-        slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
-        least = find_least(slope, square, sides, slack).reshape(t.shape)
-        defects = np.abs(np.einsum("ksd,ksd->k", costate, motion.defects))
-        gains.append((defects - least @ weights / 2 * lengths) / size)
-    return gains
-
-
-def _choose_halvings(
-    search: TimeSearch,
-    solution: TimeSolution,
-    motions: Sequence[StageMotion],
-    misses: Sequence[LimitMisses],
-    gains: Sequence[Array],
-) -> list[NDArray[np.int64]]:
-    """How often to halve each interval; gains do not count with a given number of intervals."""
-    options, phases = search.options, len({stage.phase for stage in solution.stages})
-    share = max(1.0, math.sqrt(DEFAULT_ACCURACY / options.accuracy))
-    most = math.ceil(SETTINGS.intervals * share) * phases
-    if sum(stage.intervals for stage in solution.stages) >= most:
-        return []
-    on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-    nlp, prices, times = solution.nlp, list[Array](), list[NDArray[np.int64]]()
-    for rows, miss, motion in zip(nlp.rows_of, misses, motions, strict=True):
-        # Relative cost of raising limits by their misses, by multipliers.
-        price = np.zeros_like(miss.held)
-        for side, on_rows, indices in rows.parts:
-            price[:, side] += (on_g if on_rows else on_x)[indices].sum(axis=1)
-        cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
-        prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
-        # Errors of collocation decrease with the scheme's order, costs with the third one.
-        dear = np.maximum(prices[-1] / SETTINGS.dear, 1.0)
-        error = np.maximum(np.abs(motion.defects).max(axis=(1, 2)) / SETTINGS.defect, 1.0)
-        wanted = np.ceil(np.maximum(np.log2(dear) / 3, np.log2(error) / search.scheme.order))
-        times.append(np.clip(wanted, 0, SETTINGS.at_once).astype(np.int64))
-    shares = [gain + price for gain, price in zip(gains, prices, strict=True)]
-    if options.time_intervals is None and _sum(shares) > options.accuracy:
-        left = SETTINGS.spare * options.accuracy
-        if search.problem.scene.has_slow_motors:
-            # Their gains are those of the last iterate, and not of the next one.
-            left = max(left, 0.5 * _sum(shares))
-        more = spread_halvings(shares, left)
-        times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
-    count = sum(int((2**mine).sum()) for mine in times)
-    return times if count <= most else [np.minimum(mine, 1) for mine in times]
 
 
 def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:

@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
-_Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
 
 
 def plan_phases(
@@ -107,7 +106,7 @@ def plan_phases(
 
     search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
-    named_solution = _resume(search, guesses, begun) if begun else None
+    solution = _resume(search, guesses, begun) if begun else None
     stages = list_stages(fastest)
 
     def replan(parameter: Parameter, value: float) -> object:
@@ -116,35 +115,35 @@ def plan_phases(
         return plan_phases(other, same, z, options.roughen(), explained=False, patient=False)
 
     explanation = replan if explained else None
-    if named_solution is None and free:
+    if solution is None and free:
         guess = guesses.along(free)
         if problem.scene.has_slow_motors or problem.scene.control_period:
-            named_solution = change_torques(search, guess, stages if pinned else [])
+            solution = change_torques(search, guess, stages if pinned else [])
         else:
-            named_solution = solve_guesses(search, [guess])
-    for guess in guesses.list_given() if named_solution is None else ():
+            solution = solve_guesses(search, [guess])
+    for guess in guesses.list_given() if solution is None else ():
         # One by one: the first may lead to modes in which limits between points leave nothing.
-        named_solution = named_solution or solve_guesses(search, [guess])
-    if named_solution is None:
+        solution = solution or solve_guesses(search, [guess])
+    if solution is None:
         listed = iter([guesses.nearest])
         if patient:
             listed = chain(guesses.every(), _free_ends(search, guesses))
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
-        named_solution = solve_guesses(
+        solution = solve_guesses(
             search,
             listed,
             lambda: refuse(search, guesses.nearest.stages, explanation),
         )
-    if named_solution is None and _can_last(search, stages):
+    if solution is None and _can_last(search, stages):
         raise SolverError(
             f"no plan for {name_phases(search.numbers)}: the solver did not converge for the "
             "largest margin, although the motion of least time keeps all limits; try another "
             "duration (--duration) or number of intervals per phase (--time-intervals)"
         )
-    if named_solution is None:
-        named_solution = _solve_elastic(search, guesses, explanation)
-    plans = list_plans(search, *named_solution)
+    if solution is None:
+        solution = _solve_elastic(search, guesses, explanation)
+    plans = list_plans(search, solution)
     if problem.scene.control_period:
         kept = "error", "sequences", "complete"
         return [
@@ -154,7 +153,7 @@ def plan_phases(
     return plans
 
 
-def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> _Named:
+def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> TimeSolution:
     """The plan with the torques that motors and control periods allow, from one with free torques.
 
     It keeps the modes of that, and for `margin` ends where the stages `fastest` do, if any.
@@ -171,7 +170,7 @@ def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -
     if search.source.scene.control_period:
         solution = hold_torques(search, solution.stages if solution else stages)
     assert solution is not None
-    return solution, guess.name
+    return solution._replace(attempt=guess.name)
 
 
 def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
@@ -256,27 +255,27 @@ def try_phases(
         solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
         if solution.success:
             search, solution = choose_end(search, solution)
-            first, *others = list_plans(search, solution, guess.name)
+            first, *others = list_plans(search, solution._replace(attempt=guess.name))
             return [first._replace(complete=not options.mode_search), *others]
     return None
 
 
 def solve_guesses(
     search: TimeSearch, guesses: Iterable[Guess], refuse: Callable[[], None] | None = None
-) -> _Named | None:
+) -> TimeSolution | None:
     """The best plan from guesses that are tried in their order; None without any.
 
     If the first ones fail, `refuse` may raise an error that says why.
     """
-    coarse, lost = list[_Named](), list[_Named]()
+    coarse, lost = list[TimeSolution](), list[TimeSolution]()
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
         solution = solve_coarse(search, guess)
-        if solution.success and any(is_same(solution, other) for other, _ in lost):
+        if solution.success and any(is_same(solution, other) for other in lost):
             continue
         if solution.success:
-            coarse.append((solution, guess.name))
+            coarse.append(solution)
         elif refuse and not coarse and guess.name == NEAREST:
             refuse()
         if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
@@ -298,7 +297,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
     if solution.success and solution.margin < -5e-7:  # rounding
         # A motion that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
-    return solution
+    return solution._replace(attempt=guess.name)
 
 
 def is_same(one: TimeSolution, other: TimeSolution) -> bool:
@@ -315,15 +314,15 @@ def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
     return any(sign_sequence(moved) != sequence for moved in list_neighbours(search, solution))
 
 
-def _refine_best(search: TimeSearch, coarse: Sequence[_Named]) -> _Named | None:
+def _refine_best(search: TimeSearch, coarse: Sequence[TimeSolution]) -> TimeSolution | None:
     """The best of refined solutions, of which those are left out whose coarse ones cost more."""
-    best: _Named | None = None
-    for solution, name in sorted(coarse, key=lambda pair: pair[0].cost):
-        if best and best[0].cost < solution.cost:
+    best: TimeSolution | None = None
+    for rough in sorted(coarse, key=attrgetter("cost")):
+        if best and best.cost < rough.cost:
             break
-        solution = finish(search, solution)
-        if solution.success and (best is None or solution.cost < best[0].cost):
-            best = solution, name
+        solution = finish(search, rough)._replace(attempt=rough.attempt)
+        if solution.success and (best is None or solution.cost < best.cost):
+            best = solution
     return best
 
 
@@ -343,16 +342,15 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         others = chain(_list_as_good(search, coarse), [solution] * (searched is not solution))
         solutions = (refine_stages(search, other) for other in others)
         refined = next((solution for solution in solutions if solution.success), refined)
-    solution = refined
-    fewer = drop_gone(search, solution) if solution.success else solution
-    if fewer is not solution:
+    if not refined.success:
+        return refined
+    fewer = drop_gone(search, refined)
+    if fewer is not refined:
         # Phase 3 of query 57 does not hold in its replay otherwise.
         fewer = refine_stages(search, fewer)
-        if fewer.success and fewer.cost - solution.cost < WORTH * abs(solution.cost):
-            solution = fewer
-    if solution.success and search.options.ranges:
-        return keep_within(search, solution)
-    return solution
+        if fewer.success and fewer.cost - refined.cost < WORTH * abs(refined.cost):
+            refined = fewer
+    return keep_within(search, refined) if search.options.ranges else refined
 
 
 def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
@@ -510,7 +508,7 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
 
 def _resume(
     search: TimeSearch, guesses: Guesses, begun: Sequence[PhasePlan[Motion]]
-) -> _Named | None:
+) -> TimeSolution | None:
     """Plan from coarse plans of one NLP, in their modes where these have been searched."""
     coarse, guess = begun[0], guesses.resume(begun[0].attempt, list_stages(begun))
     if not (coarse.complete or coarse.sequences > 1):
@@ -570,9 +568,9 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         return
     stages = [
         replace(stage, until=stage.until and scaled_phases[stage.phase].until)
-        for stage in coarse[0].stages
+        for stage in coarse.stages
     ]
-    moved = search.solve(stages, coarse[0], ITERATIONS)
+    moved = search.solve(stages, coarse, ITERATIONS)
     if moved.success:
         yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
@@ -584,7 +582,7 @@ def _set_free(phase: Phase) -> Phase:
     return replace(phase, until=replace(phase.until, pins=()))
 
 
-def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> _Named:
+def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
     """Plan from motions of least violation, or the error that says why there is none."""
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
@@ -594,9 +592,9 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
         elastic = soft.solve(guess.stages)
         if elastic.success and not list_shortfalls(search, elastic.stages):
             # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
-            named_solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
-            if named_solution is not None:
-                return named_solution
+            solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
+            if solution is not None:
+                return solution
         elif elastic.success:
             short.append(elastic.stages)
     if not short:
@@ -604,9 +602,7 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     raise explain_stages(search, short, replan)
 
 
-def list_plans(
-    search: TimeSearch, solution: TimeSolution, attempt: str
-) -> list[PhasePlan[TimeMotion]]:
+def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase."""
     problem, plans = search.source, list[PhasePlan[TimeMotion]]()
     scales, first = problem.scene.scales, search.tried
@@ -620,7 +616,7 @@ def list_plans(
             weight = search.options.time_weight * scales.torque**2
             value = weight * motion.duration + motion.torque.integrate_squares()
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
-        plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=of_phase)
+        plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
     plans[0] = plans[0]._replace(sequences=first.sequences, complete=first.complete)
     return plans
