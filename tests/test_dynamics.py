@@ -39,7 +39,7 @@ from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse, reduced_ine
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
 from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
-from wholearm.planning.blocks import ImpactSequence, make_sequence
+from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
@@ -200,7 +200,7 @@ MASS = 0.2
 def chain_of(path: Path) -> ImpactSequence:
     """Two of the four impacts are possible with a rough right finger, and none without."""
     problem = problem_of(path)
-    return make_sequence(problem.phases, trace_phases(problem))
+    return ImpactSequence(problem.phases, trace_phases(problem))
 
 
 def check_momenta(impact: Impact, z: Array, before: Array) -> None:

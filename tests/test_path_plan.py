@@ -29,7 +29,7 @@ from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, inverse
 from wholearm.planning import lower_bound
-from wholearm.planning.blocks import make_sequence
+from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
@@ -185,7 +185,7 @@ def test_plans_come_near_the_bound(curves: tuple[Curve, ...]) -> None:
     for curve in (curves[0], curves[2], curves[4], tip_on(0.5)):
         check_bound((curve,), EPSILON, 80, 2e-4)
     problem = problem_of(IMPACTS)
-    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
+    chain = ImpactSequence(problem.phases, trace_phases(problem)).split()[0]
     check_bound(chain.continuous_curves, EPSILON, 80, 5e-4)
 
 
@@ -461,7 +461,7 @@ def test_where_nothing_is_advised_nothing_helps() -> None:
 
 def test_phases_that_impacts_join_are_advised_together() -> None:
     problem = problem_of(IMPACTS)
-    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
+    chain = ImpactSequence(problem.phases, trace_phases(problem)).split()[0]
     with pytest.raises(InfeasibleError) as caught:
         chain.plan(1.0, OPTIONS)
     found = re.match(

@@ -30,7 +30,7 @@ from ..geometry.curve import Curve, tangent_basis
 from ..geometry.tracing import trace_phase, trace_phases
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.limits import LimitSet
-from ..planning.blocks import BlockPlan, Planning, make_sequence, plan_blocks
+from ..planning.blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain import path_data, path_motion, path_nlp, path_plan
 from ..planning.phase_plan import combine
@@ -140,7 +140,7 @@ def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
         for phase in phases:
             curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
             z = curves[-1].end
-        parts = make_sequence(phases, curves).split()
+        parts = ImpactSequence(phases, curves).split()
         for iterate, part in zip(iterates, parts, strict=True):
             terms += _evaluate_path(iterate, part.continuous_curves, problem.epsilon)
         return terms, z

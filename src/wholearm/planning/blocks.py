@@ -237,7 +237,7 @@ def trace_block(planning: Planning, block: Sequence[Phase], z: Array) -> ImpactS
         known, later = phase.index < len(stored), planning.problem.phases[phase.index + 1 :]
         curves.append(stored[phase.index] if known else trace_phase(phase, z, later))
         z = curves[-1].end
-    return make_sequence(block, curves)
+    return ImpactSequence(block, curves)
 
 
 def _plan_over_time(
@@ -459,14 +459,17 @@ def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpa
 class ImpactSequence:
     """One-freedom phases, each but the last ended by an impact or smoothly."""
 
-    phases: tuple[Phase, ...]
-    curves: tuple[Curve, ...]  # parametrised by arc length
-    impacts: tuple[CurveImpact, ...]  # between one curve and the next
+    phases: Sequence[Phase]
+    curves: Sequence[Curve]  # parametrised by arc length
+
+    @cached_property
+    def impacts(self) -> list[CurveImpact]:
+        """Between one curve and the next."""
+        return [*map(compute_curve_impact, self.phases[:-1], self.curves[:-1], self.curves[1:])]
 
     def part(self, start: int, stop: int) -> ImpactSequence:
         """Phases `start` to `stop`, without the latter."""
-        impacts = self.impacts[start : stop - 1]
-        return ImpactSequence(self.phases[start:stop], self.curves[start:stop], impacts)
+        return ImpactSequence(self.phases[start:stop], self.curves[start:stop])
 
     def split(self) -> list[ImpactSequence]:
         """Split where an impact is not possible."""
@@ -500,12 +503,6 @@ class ImpactSequence:
                 speed = measure_speed(phase.formation.scene, end_of(plan)[1] * join.possible)
                 impacts.append(make_transition(phase, join.impact, join.ratio, join.reason, speed))
         return impacts
-
-
-def make_sequence(phases: Sequence[Phase], curves: Sequence[Curve]) -> ImpactSequence:
-    """Chain phases along their curves."""
-    impacts = map(compute_curve_impact, phases[:-1], curves[:-1], curves[1:])
-    return ImpactSequence(tuple(phases), tuple(curves), tuple(impacts))
 
 
 def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptions) -> Plans:

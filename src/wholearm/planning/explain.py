@@ -207,23 +207,13 @@ def find_shortfalls(
     return shortfalls
 
 
-def explain(
-    phases: Sequence[int],
-    shortfalls: Iterable[Shortfall],
-    motion: Trajectory | None,
-    parameters: Iterable[Parameter],
-    list_values: Callable[[Parameter], Sequence[float] | None],
-    replan: Replan | None,
-    most: float = math.inf,
+def rank(
+    phases: Sequence[int], shortfalls: Iterable[Shortfall], motion: Trajectory | None
 ) -> InfeasibleError:
-    """The error for phases with a motion of least violation: shortfalls, the worst first, advice.
-
-    The other arguments are those of `advise`.
-    """
+    """The error for phases with a motion of least violation: shortfalls, the worst first."""
     ranked = sorted(shortfalls, key=lambda short: -short.share)
     text = f"{name_phases(phases, 'infeasible')}: {'; '.join(map(str, ranked))}"
-    error = InfeasibleError(text, ranked, (), motion)
-    return advise(error, parameters, list_values, replan, most)
+    return InfeasibleError(text, ranked, (), motion)
 
 
 def explain_curves(task: Task, stopped: str) -> WholearmError:
@@ -279,8 +269,8 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
         formations = [part.curve.formation for part in parts]
         missing = assemble_motions(motions, torques, formations, 201, status="misses limits least")
-    replan = partial(_replan_task, task)
-    return explain(task.phases, shortfalls, missing, may_change, list_values, replan)
+    error = rank(task.phases, shortfalls, missing)
+    return advise(error, may_change, list_values, partial(_replan_task, task))
 
 
 def _change_task(task: Task, parameter: Parameter, value: float) -> Task:
@@ -400,7 +390,7 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
     """Raise an InfeasibleError if no motion can begin from rest, or come to rest at the end.
 
     The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
-    for `explain`.
+    for `advise`.
     """
     problem, phases = search.source, search.phases
     epsilon, last = search.problem.epsilon, stages[-1]
@@ -565,7 +555,8 @@ def explain_stages(
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    return explain(numbers, lists[best], motion, parameters, list_values, replan, ADVICE)
+    error = rank(numbers, lists[best], motion)
+    return advise(error, parameters, list_values, replan, ADVICE)
 
 
 def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfall]:
