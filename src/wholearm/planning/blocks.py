@@ -345,19 +345,24 @@ def _require_margin(planning: Planning) -> Planning:
     return planning
 
 
+def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:
+    """The block after another; none after the last one."""
+    index = block[-1].index + 1
+    return next((other for other in split_blocks(problem) if other[0].index == index), ())
+
+
 def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
     """Cost-to-go of a block in the time domain with a free end on a curve.
 
     Without limits of motors: its gradient is nearly the same, and soon known.
     """
     problem, options = free_torques(planning.problem, options)
-    planning, index = replace(planning, problem=problem), block[-1].index + 1
-    if runs_along_curves(block, options) or index == len(problem.phases):
+    planning, following = replace(planning, problem=problem), find_following(problem, block)
+    if runs_along_curves(block, options) or not following:
         return None
-    phase, ending = problem.phases[index], block[-1]
+    phase, ending = following[0], block[-1]
     until = ending.until.contact
     gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    following = next(phases for phases in split_blocks(problem) if phases[0] is phase)
     if (
         options.goal is Objective.MARGIN
         or until is None
@@ -524,7 +529,11 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
             if block_before.chain
             else block_before.plans[-1].end_torques[1]
         )
-    firsts = [*(part.curves[0] for part in parts[1:]), _find_following(planning, sequence, options)]
+    following = find_following(planning.problem, sequence.phases)
+    beyond: Curve | Formation | None = following[0].formation if following else None
+    if following and runs_along_curves(following, options):
+        beyond = trace_block(planning, following[:1], sequence.curves[-1].end).curves[0]
+    firsts = [*(part.curves[0] for part in parts[1:]), beyond]
     plans: Plans = []
     junction: Junction | None = None
     for part, after in zip(parts, firsts, strict=True):
@@ -546,18 +555,3 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
         plans += plan
         junction, before = coming, last
     return plans
-
-
-def _find_following(
-    planning: Planning, sequence: ImpactSequence, options: PlanOptions
-) -> Curve | Formation | None:
-    """The curve after a block along curves, or its formation in the time domain, if any."""
-    index, phases = sequence.phases[-1].index + 1, planning.problem.phases
-    if index == len(phases):
-        return None
-    following = next(block for block in split_blocks(planning.problem) if block[0] is phases[index])
-    if not runs_along_curves(following, options):
-        return phases[index].formation
-    if index < len(planning.curves):
-        return planning.curves[index]
-    return trace_phase(phases[index], sequence.curves[-1].end, phases[index + 1 :])

@@ -368,10 +368,8 @@ def _list_settlings(plan: Plan) -> Iterator[str | Table]:
 
 def _describe_held(plan: Plan) -> Iterator[str]:
     """Relative cost of torques held over control periods."""
-    scene, free = (
-        plan.problem.scene,
-        [phase.unheld for phase in plan.phases if phase.unheld is not None],
-    )
+    scene = plan.problem.scene
+    free = [phase.unheld for phase in plan.phases if phase.unheld is not None]
     if len(free) == len(plan.phases):
         value = combine(plan.options.goal, free)
         text = f"torques {scene.control_hold} over {1e3 * scene.control_period:g} ms each:"
