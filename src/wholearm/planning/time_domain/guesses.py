@@ -266,10 +266,7 @@ class Guesses:
         return Guess(name, self._leave_room(stages))
 
     def every(self, goal: Array | None = None) -> Iterator[Guess]:
-        """All of them in their order, as the table of the README lists them.
-
-        `goal`: the end of the first, straight one; without it, that of a phase with pins.
-        """
+        """All in their order; `goal`: the end of the first, straight one, or that of pins."""
         given = goal is not None
         if not given and self._is_planar() and self.search.phases[0].until.pins:
             goal = find_end(self.search.phases[0], self.z)
