@@ -235,6 +235,7 @@ class _Looks(NamedTuple):
         capped = self.label == _CAPPED
         off = (np.minimum(self.share, 1 - self.share) > 0.03) & ~capped  # at neither extreme
         along = capped[[first, last]]
+        # Case: a rolling tip at the largest epsilon that its cone allows.
         first = int(np.flatnonzero(~off[: first + 1]).max(initial=0))
         last = last + int(np.argmin(off[last:]))
         within = (self.element >= self.element[first]) & (self.element <= self.element[last])
