@@ -495,8 +495,20 @@ def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
 
 
 def _fall(data: PhaseData) -> float:
-    """The b of a fall over the length of the curve [m^2/s^2]."""
-    return 2 * data.curve.formation.scene.scales.acceleration * float(data.grid.s[-1])
+    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
+    length, forces = float(data.grid.s[-1]), data.nodes.forces
+    fall = 2 * data.curve.formation.scene.scales.acceleration * length
+
+    def usual(coefficients: Array) -> float:
+        """Value at which this coefficient alone takes a joint to its torque limit."""
+        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
+
+    # The upper median; NumPy's takes 10 ms to import what it needs.
+    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
+    median = float(np.partition(b_max, middle)[middle])
+    inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
+    # Above what torques alone allow; case: joints with strong drag.
+    return min(fall, 30.0 * min(inertia, drag, median))
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
