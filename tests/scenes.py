@@ -240,26 +240,16 @@ epsilon = 0.05
 object = { vertices = [[0, 0], [0.08, 0], [0.08, 0.03], [0.03, 0.09], [0, 0.09]], mass = 0.35 }
 friction = { palm = 0.02, finger1 = 0.02, finger2 = 0.02 }
 start = { flush = 0, x = 0.04 }
+phases = [
+  { contacts = ["v0-palm", "v1-palm", "v1-finger1", "v4-finger2"], until = "v2-finger1" },
+  { contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-finger2"], until = "v4-tip2", end = "smooth" },
+  { contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-tip2"], until = "e4-tip2", end = "smooth" },
+  { contacts = ["v1-palm", "v1-finger1", "v2-finger1", "e4-tip2"], until = "v0-finger2" },
+  { contacts = ["v1-palm", "v2-finger1", "v0-finger2"], until = { contact = "v3-finger1", x = 0.08804 } },
+]
 [fingers]
 1 = { base = [0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
 2 = { base = [-0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
-[[phases]]
-contacts = ["v0-palm", "v1-palm", "v1-finger1", "v4-finger2"]
-until = "v2-finger1"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-finger2"]
-until = "v4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-tip2"]
-until = "e4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "e4-tip2"]
-until = "v0-finger2"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v0-finger2"]
-until = { contact = "v3-finger1", x = 0.08804 }
 """  # noqa: E501
 """Five phases of a flip: a contact passes from a link over its tip to an edge; then a landing."""
 
@@ -268,33 +258,18 @@ epsilon = 0.05654
 object = { vertices = [[0, 0], [0.07, 0], [0.09, 0.04], [0.03, 0.08], [-0.01, 0.04]], mass = 0.2261 }
 friction = { palm = 0.05, finger1 = 0.05, finger2 = 0.05 }
 start = { flush = 0, x = 0.01595 }
+phases = [
+  { contacts = ["v0-palm", "v1-palm", "v2-finger1", "v4-finger2"], until = "v0-finger2" },
+  { contacts = ["v1-palm", "v2-finger1", "v0-finger2", "v4-finger2"], until = "v3-finger1" },
+  { contacts = ["v1-palm", "v2-finger1", "e2-tip1", "v4-finger2"], until = "v3-tip1" },
+  { contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v4-finger2"], until = "v4-tip2", end = "smooth" },
+  { contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v4-tip2"], until = "e4-tip2", end = "smooth" },
+  { contacts = ["v1-palm", "v2-finger1", "v3-finger1", "e4-tip2"], until = "v0-finger2", end = "impact" },
+  { contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v0-finger2"], until = "v2-palm" },
+]
 [fingers]
 1 = { base = [0.08507, -0.01063], length = 0.1489, radius = 0.005317, inertia = 0.006393, viscous = 0.0124, dry = 0.01202, torque_limit = 2.405 }
 2 = { base = [-0.08507, -0.01063], length = 0.1489, radius = 0.005317, inertia = 0.006393, viscous = 0.0124, dry = 0.01202, torque_limit = 2.405 }
-[[phases]]
-contacts = ["v0-palm", "v1-palm", "v2-finger1", "v4-finger2"]
-until = "v0-finger2"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v0-finger2", "v4-finger2"]
-until = "v3-finger1"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "e2-tip1", "v4-finger2"]
-until = "v3-tip1"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v4-finger2"]
-until = "v4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v4-tip2"]
-until = "e4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v3-finger1", "e4-tip2"]
-until = "v0-finger2"
-end = "impact"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v3-finger1", "v0-finger2"]
-until = "v2-palm"
 """  # noqa: E501
 """A flip in four phases of one motion: a link passes over its tip to an edge, and then lies on it,
 by an impact that gives the tip a rate away from the edge."""
