@@ -180,8 +180,8 @@ def follow(
     scene: Any = SimpleNamespace(scene=SimpleNamespace(scales=scales))
     trial = Trial(scene, None, np.zeros(5), windows, np.zeros(3), FEW)  # type: ignore[arg-type]
     t = np.linspace(0, 1, 11)
-    # "c" is made at 0.45 and bounces, if it presses from 0.46 on.
-    events = [SimpleNamespace(contact="c", kind=EventKind.GAINED, time=0.45)]
+    # "c" strikes at 0.45, if it presses from 0.46 on.
+    events = [SimpleNamespace(contact="c", kind=EventKind.IMPACT, time=0.45)]
     events *= ("c", 0.46, 1) in stretches
     simulation: Any = SimpleNamespace(
         t=t,
@@ -191,7 +191,7 @@ def follow(
         stretches=[
             SimpleNamespace(contact=name, start=start, stop=stop) for name, start, stop in stretches
         ],
-        find=lambda kind: [event for event in events if event.kind is kind],
+        events=events,
         outcome=SimpleNamespace(kind=None, text=""),
     )
     simulation.list_pauses = partial(Simulation.list_pauses, simulation)

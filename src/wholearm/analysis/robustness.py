@@ -32,9 +32,9 @@ from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
+from ..simulation.events import FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
-from ..verification.free import MOMENT, REACHED, TURNED, list_aliases, list_gained
+from ..verification.free import MOMENT, REACHED, TURNED, find_touch, list_aliases, list_gained
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
@@ -253,12 +253,8 @@ class Trial:
         for window in self.windows:
             gains = [s.start for s in simulation.stretches if s.contact in window.gained]
             gain = min((time for time in gains if time > began), default=math.inf)
-            # A phase ends when its contact is made, even if it bounces then.
-            makes = simulation.find(EventKind.GAINED)
-            times = (event.time for event in makes if event.contact in window.gained)
-            made = min((time for time in times if time > began), default=gain)
             planned = window.stop + delay
-            stop = min(planned, gain, made)
+            stop = min(planned, find_touch(simulation, window.gained, began))
             for name in window.contacts:
                 c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))

@@ -8,7 +8,7 @@ With torques alone a phase ends where its `until` is reached, and with a policy 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -121,9 +121,8 @@ def verify_policy(
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
         number, start = phase.number, loop.began[phase.number]
         stop = loop.began.get(number + 1, float(whole.t[-1]))
-        names = list_gained(problem, phase)
-        gains = [s.start for s in whole.stretches if s.contact in names and s.start > start]
-        losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed, moment))
+        touch = find_touch(whole, list_gained(problem, phase), start)
+        losses = tuple(find_losses(whole, phase, start, min(stop, touch), allowed, moment))
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))
@@ -235,6 +234,17 @@ def list_gained(problem: Problem, phase: Phase) -> set[str]:
     new = {name for after in following for name in after.formation.names}
     gained = {phase.until.contact.name} if phase.until.contact is not None else set()
     return (new | gained).difference(phase.formation.names, *list_aliases(problem, phase).values())
+
+
+def find_touch(simulation: FreeSimulation, contacts: Collection[str], start: float) -> float:
+    """When one of some contacts first touches after `start`, if only to bounce; infinity if none.
+
+    An impact may lift other contacts, before the one that strikes presses for good.
+    """
+    kinds = EventKind.IMPACT, EventKind.GAINED
+    times = [e.time for e in simulation.events if e.kind in kinds and e.contact in contacts]
+    times += [s.start for s in simulation.stretches if s.contact in contacts]
+    return min((time for time in times if time > start), default=math.inf)
 
 
 def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
