@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
 from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
-from scenes import box, fading, tip
+from scenes import box, fading, read_lines, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia, plan_path
 from wholearm import Problem
@@ -38,7 +38,6 @@ from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_pa
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
 from wholearm.search.edges import BorderEdge, Edge, Terms, edge_along
 from wholearm.search.places import make_place
@@ -328,7 +327,6 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
 
 
-BOX_LIMIT = float(box().scene.torque_limit.max())
 ANY = -1.0
 """Least uniqueness margin that cones are looked at with, unique or not."""
 
@@ -365,7 +363,7 @@ def test_forces_stay_inside_the_friction_cone(objective: str) -> None:
     samples = sample(chosen, 4000)
     assert margin(samples, 0.5).min() >= 0.5 * EPSILON - 1e-6
     assert samples.c_n.min() >= EPSILON - 1e-6
-    assert np.abs(samples.tau).max() <= BOX_LIMIT + 1e-6
+    assert np.abs(samples.tau).max() <= box().scene.torque_limit.max() + 1e-6
     # The margin that is planned for is that of the normal forces alone.
     if objective == "margin":
         assert samples.c_n.min() >= chosen.value - 1e-6 > EPSILON
@@ -512,44 +510,33 @@ def test_the_bound_shares_nothing_with_the_nlp() -> None:
             assert [alias.name for alias in node.names] == ["numpy"]
 
 
-OCTAGON = """
-    v0-palm v1-palm e2-tip1 v7-finger2 > v0-finger2
-    v0-palm e2-tip1 v0-finger2 v7-finger2 > v2-tip1
-    v0-palm v2-tip1 v0-finger2 v7-finger2 > e1-tip1
-    v0-palm e1-tip1 v0-finger2 v7-finger2 > v1-palm
-"""
-"""A slide on edge 0 until an edge is flush on finger 2, and the flip that follows."""
-
-
-def trace_octagon() -> tuple[tuple[Curve, ...], float]:
-    """The curves of the flip, which is slowest by far where a joint turns back, and epsilon."""
-    finger = {"length": 0.2, "radius": 0.015, "inertia": 0.004, "viscous": 0.01, "dry": 0.01}
-    finger["torque_limit"] = 5.0
-    near, far = 0.02296, 0.05543
-    corners = [(-near, -far), (near, -far), (far, -near), (far, near)]
-    phases = [own.split(" > ") for own in OCTAGON.split("\n") if own.strip()]
-    problem = build_problem(
-        {
-            "object": {"vertices": [*corners, *((-x, -y) for x, y in corners)], "mass": 0.5},
-            "fingers": {
-                "1": {"base": [0.14, -0.02], **finger},
-                "2": {"base": [-0.14, -0.02], **finger},
-            },
-            "friction": {"palm": 0.29, "finger1": 0.2, "finger2": 0.2},
-            "epsilon": 0.05,
-            "start": {"flush": 0, "x": -0.11},
-            "phases": [{"contacts": own.split(), "until": until} for own, until in phases],
-        }
-    )
-    return trace_phases(problem)[1:], problem.epsilon
-
-
 def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Some of the grids are too coarse there for any motion, others for more than a crawl."""
-    curves, epsilon = trace_octagon()
-    least = []
+    """A flip after a slide until an edge is flush on finger 2 is slowest where a joint turns back.
+
+    Some of the grids are too coarse there for any motion, others for more than a crawl.
+    """
+    text = """
+        epsilon = 0.05
+        object.mass = 0.5
+        object.vertices = [[-0.02296, -0.05543], [0.02296, -0.05543], [0.05543, -0.02296],
+            [0.05543, 0.02296], [0.02296, 0.05543], [-0.02296, 0.05543], [-0.05543, 0.02296],
+            [-0.05543, -0.02296]]
+        fingers.1 = {base = [0.14, -0.02], length = 0.2, radius = 0.015,
+            inertia = 0.004, viscous = 0.01, dry = 0.01, torque_limit = 5.0}
+        fingers.2 = {base = [-0.14, -0.02], length = 0.2, radius = 0.015,
+            inertia = 0.004, viscous = 0.01, dry = 0.01, torque_limit = 5.0}
+        friction = {palm = 0.29, finger1 = 0.2, finger2 = 0.2}
+        start = {flush = 0, x = -0.11}
+        phases = [
+            {contacts = ["v0-palm", "v1-palm", "e2-tip1", "v7-finger2"], until = "v0-finger2"},
+            {contacts = ["v0-palm", "e2-tip1", "v0-finger2", "v7-finger2"], until = "v2-tip1"},
+            {contacts = ["v0-palm", "v2-tip1", "v0-finger2", "v7-finger2"], until = "e1-tip1"},
+            {contacts = ["v0-palm", "e1-tip1", "v0-finger2", "v7-finger2"], until = "v1-palm"}]
+    """
+    problem, least = read_lines(text), []
+    curves, epsilon = trace_phases(problem)[1:], problem.epsilon
     for intervals in (50, 100):
         monkeypatch.setattr(lower_bound, "GRID_INTERVALS", intervals)
         found = bound_least_time(curves, epsilon)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import tomllib
 from dataclasses import replace
@@ -572,28 +571,18 @@ HARD = {
 """Vertices [m], fingers (base, length, radius) [m], start (edge, x), poses [m, deg], an end."""
 
 
-def build_table(
-    vertices: str, hands: list[tuple[list[float], float, float]], start: tuple[int, float]
-) -> dict[str, Any]:
-    """A problem file's tables whose phase names what touches at the start."""
-    table = copy.deepcopy(HEPTAGON_TABLE) | {"start": {"flush": start[0], "x": start[1]}}
-    corners = [[float(x) for x in corner.split()] for corner in vertices.split(";")]
-    table["object"]["vertices"] = corners
-    for finger, (base, length, radius) in zip(table["fingers"].values(), hands, strict=True):
-        finger |= {"base": base, "length": length, "radius": radius}
-    lowest = [f"v{start[0]}-palm", f"v{(start[0] + 1) % len(corners)}-palm"]
-    table["phases"] = [{"contacts": lowest, "until": {"x": start[1]}}]
-    return table
-
-
 @pytest.mark.parametrize("name", HARD)
 def test_hard_lists_load(name: str, tmp_path: Path) -> None:
-    vertices, hands, start, poses, end = HARD[name]
-    table = build_table(vertices, hands, start)
-    route = list_degrees(build_problem(table), *poses)
+    vertices, hands, (edge, x), poses, end = HARD[name]
+    corners = [[float(x) for x in corner.split()] for corner in vertices.split(";")]
+    changes: dict[str, Any] = {"vertices": corners, "phases": None}
+    changes["start"] = {"flush": edge, "x": x}
+    for k, hand in enumerate(hands, 1):
+        changes |= zip((f"base{k}", f"length{k}", f"radius{k}"), hand, strict=True)
+    problem = problem_of(HEPTAGON).with_(changes)
+    route = list_degrees(problem, *poses)
     assert end in [str(stretch.until) for stretch in route]
-    problem = load_pasted(table, route, tmp_path)
-    assert len(problem.phases) == len(route)
+    assert len(load_pasted(dict(problem.table), route, tmp_path).phases) == len(route)
 
 
 def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Path) -> None:
