@@ -30,6 +30,7 @@ from PIL import Image, ImageColor
 
 import scenes
 import wholearm
+from plane import place_corners
 from scenes import hexagon
 from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
 from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
@@ -49,13 +50,7 @@ from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
-from wholearm.viewer.page import (
-    Pushes,
-    build_page,
-    describe_motion,
-    write_chart,
-    write_player,
-)
+from wholearm.viewer.page import Pushes, build_page, describe_motion, write_chart, write_player
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 
@@ -216,8 +211,7 @@ def test_snapshot_is_to_scale(
     z, names = trajectory.z[row], trajectory.motions[trajectory.phase[row]].contacts
     scene, styles = heptagon.scene, choose_styles(trajectory.contacts)
     _, *links, body = draw_snapshot(axes, scene, z, names, styles)[:4]
-    c, s = np.cos(z[2]), np.sin(z[2])
-    corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
+    corners = place_corners(scene, z)
     assert isinstance(body, Polygon)
     np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-13)
     for link, finger, angle in zip(links, scene.fingers, z[3:], strict=True):
@@ -447,9 +441,6 @@ def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
     assert crossed.get_facecolor() == own.get_facecolor()
 
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
-
 def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     problem, plan = problem_of(LANDING), plan_of(LANDING)
     points, normals, _, forces, _ = Pushes.of(problem.scene, plan)
@@ -543,7 +534,8 @@ def test_animate_refuses_what_it_cannot_write(
 
 def open_in_browser(text: str, folder: Path, fragment: str) -> str:
     """What a page has become in a browser, as HTML."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
     if browser is None:
         pytest.skip("no Chromium here")
     (folder / "page.html").write_text(text, encoding="utf-8")
