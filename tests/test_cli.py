@@ -211,11 +211,7 @@ def test_problems_without_a_plan(
 )
 @pytest.mark.parametrize("verb", ["solve", "verify", "bench growth"])
 def test_unreadable_problems(
-    folder: Path,
-    capsys: Capture,
-    verb: str,
-    content: bytes | None,
-    words: str,
+    folder: Path, capsys: Capture, verb: str, content: bytes | None, words: str
 ) -> None:
     if content is not None:
         Path("p.toml").write_bytes(content)

@@ -118,13 +118,6 @@ def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str
 ROUNDING = 1e-14
 
 
-def random_pose(rng: np.random.Generator, scene: Scene) -> Array:
-    """A pose above the palm, between the joints or beyond them."""
-    phi = rng.uniform(-np.pi, np.pi)
-    lowest = rotate(phi, scene.polygon.vertices)[:, 1].min()
-    return np.array([rng.uniform(-0.09, 0.09), rng.uniform(0.0, 0.02) - lowest, phi])
-
-
 @pytest.mark.parametrize("radius", [0.0, 0.005, 0.02])
 @pytest.mark.parametrize("length", [0.06, 0.1, 0.2])
 def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
@@ -133,7 +126,10 @@ def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
     for trial in range(25):
         points = convex_polygon(rng, int(rng.integers(3, 8)))
         scene = make_scene(points, length=length, radius=radius, base=0.13, depth=-0.025)
-        q = random_pose(rng, scene)
+        # Above the palm, between the joints or beyond them.
+        phi = rng.uniform(-np.pi, np.pi)
+        lowest = rotate(phi, scene.polygon.vertices)[:, 1].min()
+        q = np.array([rng.uniform(-0.09, 0.09), rng.uniform(0.0, 0.02) - lowest, phi])
         finger = trial % 2
         try:
             angle = close_finger(scene, q, finger)

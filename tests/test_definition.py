@@ -172,7 +172,6 @@ def test_a_contact_slides_unless_it_is_said_to_roll() -> None:
     assert [c.name for c in problem.contacts].count("v1-palm") == 1
 
 
-ALLOWED_UNTIL = "allowed are a contact name"
 THREE = {
     "contacts": ["v1-palm", "v3-finger1", "v0-finger2"],
     "until": {"contact": "v2-palm", "x": 0.0, "phi_deg": 0.0},
@@ -195,7 +194,7 @@ THREE = {
         (put("phases.0.contacts.1", "v1-palm rolling"), "phases[1].contacts", "makes 5"),
         (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "' rolling' may"),
         (put("phases.3.until", "v1-palm"), "phases[4].until", "already"),
-        (put("phases.3.until", {"phi": 1}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"phi": 1}), "phases[4].until", "allowed are a contact name"),
         (put("phases.3.until", {"contact": 3}), "phases[4].until", "3 is not a contact"),
         (put("phases.3.until", {"contact": "v4-finger1", "x": 99.0}), "phases[4].until", "99"),
         (put("phases.3", THREE), "phases[4].until", "gives 3 conditions; allowed are 2"),

@@ -120,7 +120,6 @@ def list_blocks(path: Path, language: str) -> list[str]:
 make_parser = cache(build_parser)
 LINES = list(dict.fromkeys(line for path in EVERY for line in list_lines(path)))
 BLOCKS = [block for path in PAGES for block in list_blocks(path, "python")]
-CALLS = re.findall(r"`(wholearm\.\w[\w.]*\([^`]*\))`", "".join(map(read, PAGES)))
 
 
 @pytest.fixture
@@ -184,7 +183,7 @@ def test_python_blocks_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_python_calls_fit_their_functions() -> None:
-    for text in CALLS:
+    for text in re.findall(r"`(wholearm\.\w[\w.]*\([^`]*\))`", "".join(map(read, PAGES))):
         call = ast.parse(text, mode="eval").body
         assert isinstance(call, ast.Call), text
         function = eval(ast.unparse(call.func), {"wholearm": wholearm})
@@ -261,11 +260,6 @@ def test_problem_files_are_toml_and_that_of_the_readme_plans(box: Problem) -> No
     assert wholearm.solve(box).replay is not None
 
 
-def name_anchor(heading: str) -> str:
-    """What a link to a heading ends with."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-
-
 def test_links_lead_somewhere() -> None:
     for path in EVERY:
         text = re.sub(r"^```.*?^```", "", read(path), flags=re.M | re.S)
@@ -275,8 +269,9 @@ def test_links_lead_somewhere() -> None:
             found = path if not target else path.parent / target
             assert found.exists(), (path, target)
             if anchor:
-                headings = re.findall(r"^#+ (.*)$", read(found), re.M)
-                assert anchor in map(name_anchor, headings), (path, target, anchor)
+                headings = re.findall(r"^#+ (.*)$", read(found).lower(), re.M)
+                anchors = [re.sub(r"[^\w\- ]", "", own).replace(" ", "-") for own in headings]
+                assert anchor in anchors, (path, target, anchor)
 
 
 def test_modules_that_pages_name_are_there() -> None:

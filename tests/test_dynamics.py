@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise, permutations, product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -484,18 +483,13 @@ def list_loads(K: Array, count: int) -> Array:
     return np.concatenate(loads)
 
 
-def box_at(mu: float, index: int, share: float) -> tuple[Formation, Any, Array]:
-    """The box on a palm of friction mu in the middle of a phase, with its sliding directions."""
-    problem = problem_of(BOX).with_(friction_palm=mu)
-    curve = trace_phases(problem)[index]
-    point = curve.evaluate(np.array([share * curve.length]))
-    return curve.formation, point.kinematics, curve.segments[-1].Xi
-
-
-@pytest.mark.parametrize("index", [0, 2])
-def test_forces_are_unique_where_all_minors_are_positive(index: int) -> None:
+@pytest.mark.parametrize("index, share", [(0, 0.9), (2, 0.4)])
+def test_forces_are_unique_where_all_minors_are_positive(index: int, share: float) -> None:
+    """The box on palms of other friction, in the middle of a phase."""
     for mu in (0.1, 0.3, 0.5):
-        formation, kinematics, Xi = box_at(mu, index, 0.9 if index == 0 else 0.4)
+        curve = trace_phases(problem_of(BOX).with_(friction_palm=mu))[index]
+        formation, Xi = curve.formation, curve.segments[-1].Xi
+        kinematics = curve.evaluate(np.array([share * curve.length])).kinematics
         A, A_t = kinematics.A[0], kinematics.A_t[0]
         weighted = A / formation.scene.mass_diagonal
         K, smooth = weighted @ (A - (formation.friction * Xi)[:, None] * A_t).T, weighted @ A.T

@@ -34,11 +34,7 @@ from wholearm import End, Formation, Goal, InputError, Problem, Scene, Until, li
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, close_fingers, contact_table, first_contact
-from wholearm.contacts.contact_limits import (
-    FINGERS_TOUCH,
-    build_finger_gap,
-    evaluate_finger_gap,
-)
+from wholearm.contacts.contact_limits import FINGERS_TOUCH, build_finger_gap, evaluate_finger_gap
 from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.geometry.curve import Curve, join, take
 from wholearm.geometry.tracing import trace_curve, trace_phases

@@ -197,9 +197,6 @@ def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
 PHASE = 3
 """Of the heptagon, without a reversal."""
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 3)]
-EXACT = 1e-7
-"""What the reference leaves of rows that are about one: it differentiates contacts by differences
-over a microsecond."""
 DURATION = 0.06
 
 
@@ -257,8 +254,9 @@ def collocation(name: str, degree: int, count: int, contacts: int) -> tuple[Arra
     own = equations[rows.states]
     assert own.shape == (count, 2, degree + (not scheme.ends), 5 - stage.formation.n_constraints)
     # Everything else holds at once but rest at the end: contacts, balances, contacts at the ends.
+    # The reference differentiates contacts by differences over a microsecond.
     rest = 5 - stage.formation.n_constraints
-    assert np.delete(equations, rows.states)[:-rest].max() < EXACT
+    assert np.delete(equations, rows.states)[:-rest].max() < 1e-7
     return own[:, :, :-1].max(), own[:, :, -1].max()
 
 

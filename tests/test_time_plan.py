@@ -43,16 +43,7 @@ from shipped import (
     problem_of,
     tipping,
 )
-from timed import (
-    fastest_landing,
-    instants,
-    integrate,
-    landing,
-    plan_landing,
-    stages_of,
-    tables,
-    total,
-)
+from timed import fastest_landing, instants, integrate, landing, plan_landing, stages_of, total
 from wholearm import (
     End,
     Formation,
@@ -96,14 +87,6 @@ def stages() -> list[StageMotion]:
     return [stage for motion in fastest_landing() for stage in motion.stages]
 
 
-@once
-def in_time() -> Trajectory:
-    """The heptagon's last slide, for which curves are, over time."""
-    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
-    problem = part_of(problem_of(HEPTAGON), 2, 3)
-    return solve(problem, transcription="time", **options).trajectory
-
-
 THROWN: dict[str, Any] = {"time_intervals": 8, "mode_search": False, "replay": False}
 THROWN["uniqueness_margin"] = ANY
 
@@ -128,10 +111,11 @@ def statistics(stages: list[StageMotion]) -> float:
 def test_least_times_agree_with_those_along_the_curve(
     curves: tuple[Curve, ...], trajectory: Trajectory
 ) -> None:
-    plan, expected = in_time(), trajectory.meta["phase_durations"][2]
+    """The heptagon's last slide, over time."""
+    problem, expected = part_of(problem_of(HEPTAGON), 2, 3), trajectory.meta["phase_durations"][2]
+    plan = solve(problem, transcription="time", time_intervals=8, replay=False).trajectory
     (motion,) = plan.motions
     assert isinstance(motion, TimeMotion) and plan.meta["transcription"] == "time"
-    problem = part_of(problem_of(HEPTAGON), 2, 3)
     assert verify(problem, plan).ok
     assert np.nanmin(plan.c_n) > problem.epsilon - SLACK
     assert np.abs(plan.tau).max() < 2.0 + SLACK
@@ -357,9 +341,11 @@ def test_plans_are_the_same_every_time() -> None:
         for each in (problem, other, problem)
     ]
     for one, again in zip(stages_of(plans[0]), stages_of(plans[2]), strict=True):
-        for before, after in zip(tables(one.points), tables(again.points), strict=True):
-            size = np.abs(before).max(initial=0.0)
-            np.testing.assert_allclose(after, before, rtol=0, atol=1e-9 * size)
+        for before, after in zip(one.points, again.points, strict=True):
+            expected = np.asarray(before, dtype=float)
+            size = np.abs(expected).max(initial=0.0)
+            found = np.asarray(after, dtype=float)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * size)
 
 
 def test_equations_of_motion_hold_and_contacts_are_closed_at_any_instant(
@@ -661,10 +647,6 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
                 np.testing.assert_allclose(share, -Xi, rtol=1e-9)
 
 
-LANDS = 0.016
-"""Where `known_landing` ends [m]."""
-
-
 def pin(problem: Problem, index: int, *pins: tuple[str, float]) -> Problem:
     phases = list(problem.phases)
     phases[index] = replace(phases[index], until=replace(phases[index].until, pins=pins))
@@ -703,7 +685,8 @@ def test_another_place_than_the_one_pinned_fails() -> None:
     simulation = simulate(problem, trajectory.torque)
     allowance, length = Allowance(), problem.scene.scales.length
     for off, missed in ((0.0, False), (0.9, False), (1.1, True)):
-        x = LANDS + off * allowance.departure * length
+        # The motion ends at 16 mm.
+        x = 0.016 + off * allowance.departure * length
         pinned = replace(simulation, problem=pin(problem, 1, ("x", x)))
         failures = list(describe_failures(pinned, (), None, allowance))
         assert bool(failures) == missed

@@ -49,17 +49,6 @@ def scene_of() -> Scene:
     return replace(scene, fingers=(right, left), friction=Friction(0.3, 0.24, 0.18))
 
 
-def random_samples(formation: Formation) -> Samples:
-    """States and forces that obey no equation, but friction that opposes the sliding."""
-    rng, count = np.random.default_rng(5), 30
-    z = rng.uniform(-1, 1, (count, 5)) * [0.05, 0.05, 1.0, 0.5, 0.5] + [0, 0.05, 0, 1.2, 1.9]
-    v, a = rng.uniform(-1, 1, (count, 5)), rng.uniform(-5, 5, (count, 5))
-    c_n = rng.uniform(0.1, 3.0, (count, formation.n_contacts))
-    v_t = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
-    tau = rng.uniform(-1, 1, (count, 2))
-    return Samples(z, v, a, tau, c_n, -formation.friction * np.sign(v_t) * c_n)
-
-
 def check(formation: Formation, samples: Samples) -> Balance:
     return balance(formation.scene, formation.contacts, formation.rolling, samples)
 
@@ -69,13 +58,19 @@ def units(scene: Scene) -> Array:
 
 
 def test_virtual_power() -> None:
-    """Contacts do the power of c_n on gaps that open and of c_t on what slides, for any motion."""
-    scene = scene_of()
+    """Contacts do the power of c_n on gaps that open and of c_t on what slides, for any motion.
+
+    States and forces obey no equation, but friction opposes the sliding.
+    """
+    scene, rng, count = scene_of(), np.random.default_rng(5), 30
     formation = make_formation(scene, CONTACTS)
-    samples = random_samples(formation)
-    z, v, a, tau, c_n, c_t = samples
-    found = check(formation, samples)
-    rows = formation.evaluate(z, v)
+    z = rng.uniform(-1, 1, (count, 5)) * [0.05, 0.05, 1.0, 0.5, 0.5] + [0, 0.05, 0, 1.2, 1.9]
+    v, a = rng.uniform(-1, 1, (count, 5)), rng.uniform(-5, 5, (count, 5))
+    c_n = rng.uniform(0.1, 3.0, (count, formation.n_contacts))
+    rows, tau = formation.evaluate(z, v), rng.uniform(-1, 1, (count, 2))
+    v_t = np.einsum("nij,nj->ni", rows.A_t, v)
+    c_t = -formation.friction * np.sign(v_t) * c_n
+    found = check(formation, Samples(z, v, a, tau, c_n, c_t))
     np.testing.assert_allclose(found.gaps * scene.scales.length, rows.C, atol=1e-14)
     rates = np.einsum("nij,nj->ni", rows.A, v)
     np.testing.assert_allclose(found.rates * scene.scales.speed, rates, atol=1e-13)

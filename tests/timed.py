@@ -57,11 +57,6 @@ def stages_of(plans: list[PhasePlan[TimeMotion]]) -> list[StageMotion]:
     return [stage for plan in plans for stage in plan.motion.stages]
 
 
-def tables(part: StagePoints) -> list[Array]:
-    """All that a stage consists of, as arrays."""
-    return [np.asarray(value, dtype=float) for value in part]
-
-
 def instants(stage: StageMotion, per_interval: int) -> Array:
     """Times inside the intervals of a stage, shape (n,) [s]: none where its torque may step."""
     inside = (np.arange(per_interval) + 0.5) / per_interval
