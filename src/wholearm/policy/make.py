@@ -79,7 +79,7 @@ class ReferenceSettings:
     # Upper limits of the share of all intervals, if some interval has less, as a large share in one
     # interval can reduce that of another one. Case: square, 28 % slower without them.
     parts: tuple[float, ...] = (0.5, 0.2, 0.0)
-    enough: float = 0.95  # least share that needs no smaller upper limit and no slower motion
+    enough: float = 0.95  # least share that needs no slower motion
     widest: float = 0.9  # largest relative range
 
 
@@ -506,7 +506,7 @@ def retime(
         controllable_set = find_controllable(limits, reserve, np.diff(s), floor, end, shares)
         if best is None or controllable_set.share.min() > best.share.min():
             best = controllable_set
-        if best.share.min() >= min(0.8 * part, SETTINGS.enough):
+        if best.share.min() >= 0.8 * part:
             break
     assert best is not None
     return best
@@ -730,7 +730,8 @@ def make_policy(
             goes_on = phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
             # The plan goes on in motion there.
-            entry["stops"] = phase.end is End.REST is not phases[phase.index].end
+            planned_end = phases[phase.index].end
+            entry["stops"] = phase.end is End.REST and planned_end is not End.REST
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
             if not piece.passes:
                 entry["duration"] += settings.dwell + delay
