@@ -332,7 +332,7 @@ def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
     title = f"{text[0].upper()}{text[1:]}."
     parser: Parser = parsers.add_parser(name, help=text, description=title)
     for option in read_options(table):
-        option.add(parser)
+        parser.add_argument(*option.flags, **option.arguments)
     return parser
 
 

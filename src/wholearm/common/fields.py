@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from .errors import InputError, require_number, require_vector
 
@@ -279,43 +279,18 @@ def collect_keys(owner: type, table: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-_OFF = "False: "
 _NUMBER = r"-?\d[\w.+-]*?"
 _TEXT = re.compile(
     rf"(.*?)(?: = (\S+))?(?: in ({_NUMBER})\.\.({_NUMBER}))?(?: among (\S+))?", re.DOTALL
 )
 
 
-@dataclass(frozen=True)
-class Option:
+class Option(NamedTuple):
     """An option of a command, or a file that it takes."""
 
     field: Field
     flags: Sequence[str]  # the name alone where it is a file
-    metavar: str | None = None
-    nargs: str | None = None  # {"*", "+", "?", None}
-
-    def add(self, parser: argparse.ArgumentParser) -> None:
-        """Give it to a parser, with its default behind its text."""
-        field, more = self.field, dict[str, Any]()
-        if field.kind is BOOLEAN:
-            more = {"action": f"store_{str(not field.default).lower()}", "dest": field.name}
-        else:
-            more = {"metavar": self.metavar, "nargs": self.nargs}
-            more |= {"type": field.kind.parse} if isinstance(field.kind, Range) else {}
-            if self.flags[0].startswith("-"):
-                required = field.text.endswith("(required)")
-                more |= {"default": field.default, "required": required}
-            if self.nargs == "?" and "enum" in field.kind.schema:
-                more["choices"] = field.kind.schema["enum"]
-                if self.flags[0].startswith("-"):
-                    # It may be left out before a file, too: the caller puts the first word in.
-                    more |= {"nargs": None, "metavar": f"[{self.metavar}]"}
-            elif self.nargs == "?" and isinstance(field.kind, Range):
-                more["const"] = 1.0
-        default = "" if field.kind is BOOLEAN or field.default == [] else field.describe_default()
-        text = field.text.removeprefix(_OFF) + (default and f" ({default})")
-        parser.add_argument(*self.flags, help=text, **more)
+    arguments: Mapping[str, Any]  # of `ArgumentParser.add_argument`
 
 
 def read_options(table: str) -> list[Option]:
@@ -344,20 +319,34 @@ def _read_option(usage: str, rest: str = "") -> Option:
     text, default, low, high, words = match.groups()
     optional, several = usage.endswith("]"), usage.rstrip("]").endswith("...")
     parts = usage.removeprefix("[").rstrip("]").removesuffix("...").split()
-    flags = [part for part in parts if part.startswith("-")] or parts[:1]
+    flags = [part for part in parts if part.startswith("-")]
+    is_file, flags = not flags, flags or parts[:1]
     metavar = " ".join(parts[len(flags) :]).removeprefix("[") or None
     name = flags[-1].lstrip("-").replace("-", "_")
     kind: FieldKind | Range = TEXT
     field_default: Any = [] if several else default
+    nargs = ("*" if optional else "+") if several else "?" if optional else None
+    more: dict[str, Any] = {"metavar": metavar, "nargs": nargs}
     if low:
         read = float if re.search(r"[.e]", low) else int
         kind = Range(read(low), read(high))
         field_default = None if default is None else kind.parse(default)
+        more |= {"type": kind.parse} | ({"const": 1.0} if nargs == "?" else {})
     elif words:
         kind = choice(*words.split("|"))
-    elif metavar is None and flags[0].startswith("-"):
+        if optional:
+            more["choices"] = words.split("|")
+            if not is_file:
+                # It may be left out before a file, too: the caller puts the first word in.
+                more |= {"nargs": None, "metavar": f"[{metavar}]"}
+    elif metavar is None and not is_file:
         kind, field_default = BOOLEAN, name.startswith("no_")
         name = name.removeprefix("no_")
-        text = f"{_OFF if field_default else ''}{text}"
-    nargs = ("*" if optional else "+") if several else "?" if optional else None
-    return Option(Field(name, text, kind, default=field_default), flags, metavar, nargs)
+        more = {"action": f"store_{str(not field_default).lower()}", "dest": name}
+    if not is_file:
+        more |= {"default": field_default, "required": text.endswith("(required)")}
+    off = kind is BOOLEAN and field_default
+    field = Field(name, f"False: {text}" if off else text, kind, default=field_default)
+    shown = "" if kind is BOOLEAN or several else field.describe_default()
+    more["help"] = text + (shown and f" ({shown})")
+    return Option(field, flags, more)
