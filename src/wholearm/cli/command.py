@@ -1038,10 +1038,10 @@ def _animate(options: argparse.Namespace) -> int:
             motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
             write_text(options.output, build_page(problem.name, [write_player(motion)]))
         else:
-            from ..viewer.movie import Movie, write_movie
+            from ..viewer.movie import write_movie
 
-            movie = Movie(problem, trajectory, ghost, options.speed)
-            write_movie(movie, options.output, show_progress())
+            how: Any = {"speed": options.speed, "progress": show_progress()}
+            write_movie(options.output, problem, trajectory, ghost, **how)
     return finish(options, None, options.output)
 
 

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -27,6 +26,7 @@ from ..figures import snapshots, style
 from ..figures.plots import draw_margins, draw_phases, draw_torques
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
+from ..scene.model import Scene
 from .page import Pushes
 
 FRAMES = 25  # frames in a second of the movie
@@ -34,70 +34,68 @@ TURNS, GHOST = "#D55E00", "#bbbbbb"
 """Colours of torques and the cursor, and of what is drawn behind."""
 
 
-class _Scene:
-    """Hand, object and forces on axes, drawn anew for each frame."""
+def _prepare_scene(
+    axes: Axes, scene: Scene, trajectory: Trajectory, ghost: Trajectory | None
+) -> Callable[[float], list[Artist]]:
+    """What draws hand, object and forces on axes at an instant, anew for each frame."""
+    points, normals, tangents, forces, friction = Pushes.of(scene, trajectory)
+    low, high = snapshots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
+    size = float((high - low).max())
+    styles = style.choose_styles(trajectory.contacts)
+    colours = [styles[name].colour for name in trajectory.contacts]
+    # Square roots: small forces are to be seen beside large ones.
+    strengths = np.hypot(*forces.T).T[..., None]
+    strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
+    scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
+    arrows = 0.3 * size * forces / scales
+    presses = np.asarray(np.isfinite(forces).all(axis=2))
+    # Friction cones are longer than the arrows in them.
+    reach = 1.15 * np.maximum(np.hypot(*arrows.T).T, 0.03 * size)[..., None]
+    edges = friction[:, None] * tangents
+    sides = [points + reach * (normals + sign * edges) for sign in (1, -1)]
+    cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
+    every = np.vstack([low, high, cones[presses].reshape(-1, 2)])
+    low, high = every.min(axis=0) - 0.05 * size, every.max(axis=0) + 0.05 * size
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    snapshots.draw_palm(axes, scene, low[0], high[0])
+    scale, vertices = snapshots.measure_scale(axes), scene.polygon.vertices
+    shifts = snapshots.choose_numbers(scale * vertices)
+    numbers = {k: vertices[k] + shift / scale for k, shift in shifts.items()}
 
-    def __init__(
-        self, axes: Axes, problem: Problem, trajectory: Trajectory, ghost: Trajectory | None
-    ) -> None:
-        scene = self._scene = problem.scene
-        self._axes, self._trajectory, self._ghost = axes, trajectory, ghost
-        points, normals, tangents, forces, friction = Pushes.of(scene, trajectory)
-        low, high = snapshots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
-        self._size = float((high - low).max())
-        styles = style.choose_styles(trajectory.contacts)
-        self._colours = [styles[name].colour for name in trajectory.contacts]
-        # Square roots: small forces are to be seen beside large ones.
-        strengths = np.hypot(*forces.T).T[..., None]
-        strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
-        scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
-        self._points, self._arrows = points, 0.3 * self._size * forces / scales
-        self._presses = np.asarray(np.isfinite(forces).all(axis=2))
-        # Friction cones are longer than the arrows in them.
-        reach = 1.15 * np.maximum(np.hypot(*self._arrows.T).T, 0.03 * self._size)[..., None]
-        edges = friction[:, None] * tangents
-        sides = [points + reach * (normals + sign * edges) for sign in (1, -1)]
-        self._cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
-        every = np.vstack([low, high, self._cones[self._presses].reshape(-1, 2)])
-        low, high = every.min(axis=0) - 0.05 * self._size, every.max(axis=0) + 0.05 * self._size
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-        snapshots.draw_palm(axes, scene, low[0], high[0])
-        scale, vertices = snapshots.measure_scale(axes), scene.polygon.vertices
-        shifts = snapshots.choose_numbers(scale * vertices)
-        self._numbers = {k: vertices[k] + shift / scale for k, shift in shifts.items()}
-
-    def draw(self, t: float) -> list[Artist]:
+    def draw(t: float) -> list[Artist]:
         """Everything at an instant, in the order of drawing."""
-        axes, motion, artists = self._axes, self._trajectory, list[Artist]()
-        row = max(0, int(np.searchsorted(motion.t, t, side="right")) - 1)
-        z = _blend(motion.t, motion.z, t)
-        if self._ghost is not None:
-            behind = _blend(self._ghost.t, self._ghost.z, t)
-            artists += snapshots.draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
-        artists += snapshots.draw_bodies(axes, self._scene, z)
-        places = snapshots.turn(z, np.array([*self._numbers.values()]).reshape(-1, 2))
+        artists = list[Artist]()
+        row = max(0, int(np.searchsorted(trajectory.t, t, side="right")) - 1)
+        z = _blend(trajectory.t, trajectory.z, t)
+        if ghost is not None:
+            behind = _blend(ghost.t, ghost.z, t)
+            artists += snapshots.draw_bodies(axes, scene, behind, ec=GHOST, fc="none")
+        artists += snapshots.draw_bodies(axes, scene, z)
+        places = snapshots.turn(z, np.array([*numbers.values()]).reshape(-1, 2))
         look: Any = {"ha": "center", "va": "center", "color": "#555555"}
         look["fontsize"] = snapshots.NUMBER
-        for k, (x, y) in zip(self._numbers, places.tolist(), strict=True):
+        for k, (x, y) in zip(numbers, places.tolist(), strict=True):
             artists.append(axes.text(x, y, str(k), **look))
-        pressing = np.flatnonzero(self._presses[row]).tolist()
+        pressing = np.flatnonzero(presses[row]).tolist()
         for k in pressing:
-            cone = Polygon(self._cones[row, k], fc=self._colours[k], alpha=0.2, lw=0)
+            cone = Polygon(cones[row, k], fc=colours[k], alpha=0.2, lw=0)
             artists.append(axes.add_artist(cone))
         for k in pressing:
-            arrow = _trace_arrow(self._points[row, k], self._arrows[row, k], 0.018 * self._size)
-            artists.append(style.add_line(axes, arrow, color=self._colours[k], lw=1.8))
+            arrow = _trace_arrow(points[row, k], arrows[row, k], 0.018 * size)
+            artists.append(style.add_line(axes, arrow, color=colours[k], lw=1.8))
         for k in pressing:
-            dot: Any = {"marker": "o", "ms": 5.5, "mfc": self._colours[k], "mec": "white"}
-            artists.append(style.add_line(axes, self._points[row, [k]], **dot))
-        for finger, torque in zip(self._scene.fingers, motion.tau[row].tolist(), strict=True):
+            dot: Any = {"marker": "o", "ms": 5.5, "mfc": colours[k], "mec": "white"}
+            artists.append(style.add_line(axes, points[row, [k]], **dot))
+        for finger, torque in zip(scene.fingers, trajectory.tau[row].tolist(), strict=True):
             # At the limit an arc of three quarters.
             swept = 1.5 * math.pi * torque / finger.torque_limit
-            arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * self._size)
+            arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * size)
             artists.append(style.add_line(axes, arc, color=TURNS, lw=1.6))
-        return artists + snapshots.draw_joints(axes, self._scene)
+        return artists + snapshots.draw_joints(axes, scene)
+
+    return draw
 
 
 def _blend(times: Array, values: Array, t: float) -> Array:
@@ -122,55 +120,62 @@ def _trace_arc(base: Array, turn: float, radius: float) -> Array:
     return np.asarray(base + radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
-@dataclass(eq=False)
-class Movie:
-    """A motion as pictures, of 8 inches width.
+@exclusive
+def write_movie(
+    path: str | os.PathLike[str],
+    problem: Problem,
+    trajectory: Trajectory,
+    ghost: Trajectory | None = None,
+    speed: float = 0.1,
+    resolution: int = 90,
+    progress: Callable[[str], None] = lambda text: None,
+) -> None:
+    """Write a motion as GIF, or as MP4 by ffmpeg, in pictures of 8 inches width.
 
-    InputError if `speed` is not positive, or makes the movie longer than two minutes.
+    Parameters
+    ----------
+    ghost       a replay, drawn behind
+    speed       over real time
+    resolution  dots per inch
+
+    InputError if `speed` is not positive, or makes the movie longer than two minutes, there is no
+    ffmpeg for an MP4, or the file cannot be written.
     """
+    speed = require_number(speed, "--speed", positive=True)
+    duration, most = trajectory.duration, 120 * FRAMES
+    count = math.ceil(duration / speed * FRAMES) + 1
+    if count > most:
+        least = duration * FRAMES / most
+        text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
+        raise InputError("", "--speed", text)
+    times = np.linspace(0.0, duration, max(2, count))
 
-    problem: Problem
-    trajectory: Trajectory
-    ghost: Trajectory | None = None  # a replay, drawn behind
-    speed: float = 0.1  # over real time
-    resolution: int = 90  # dots per inch
-
-    def __post_init__(self) -> None:
-        speed = require_number(self.speed, "--speed", positive=True)
-        duration, most = self.trajectory.duration, 120 * FRAMES
-        frames = math.ceil(duration / speed * FRAMES) + 1
-        if frames > most:
-            least = duration * FRAMES / most
-            text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
-            raise InputError("", "--speed", text)
-        self.times = np.linspace(0.0, duration, max(2, frames))
-
-    @exclusive
-    def draw(self) -> Iterator[Array]:
+    def draw() -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
-        problem, motion = self.problem, self.trajectory
-        with style.open_figure(8.0, 7.4, dpi=self.resolution) as figure:
+        with style.open_figure(8.0, 7.4, dpi=resolution) as figure:
             canvas: Any = figure.canvas
-            scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, motion, self.ghost)
+            axes = figure.add_axes((0.02, 0.47, 0.96, 0.49))
+            draw_scene = _prepare_scene(axes, problem.scene, trajectory, ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
-            draw_margins(margins, motion, problem.epsilon, style.choose_styles(motion.contacts))
-            draw_torques(torques, motion.torque, problem.scene.torque_limit)
+            styles = style.choose_styles(trajectory.contacts)
+            draw_margins(margins, trajectory, problem.epsilon, styles)
+            draw_torques(torques, trajectory.torque, problem.scene.torque_limit)
             for axes, room in ((margins, 0.235), (torques, 0.14)):
-                draw_phases(axes, motion.phase_starts, labels=axes is margins)
+                draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
                 style.list_contacts(axes, 72 * 7.4 * room, 8.0)
             margins.set_ylabel(f"margin {style.unit_of(margins)}")
             margins.tick_params(labelbottom=False)
             label = rf"$\tau$ {style.unit_of(torques)}"
-            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, motion.duration))
+            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, duration))
             figure.align_ylabels([margins, torques])
             canvas.draw()
             still = canvas.copy_from_bbox(figure.bbox)
-            form = fixed(min(motion.duration, 0.9))
+            form = fixed(min(duration, 0.9))
             look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-            for t in self.times:
+            for k, t in enumerate(times.tolist(), start=1):
                 canvas.restore_region(still)
-                moving = scene.draw(t)
+                moving = draw_scene(t)
                 for axes in (margins, torques):
                     cursor: Any = {"color": TURNS, "lw": 1.3}
                     cursor["transform"] = axes.get_xaxis_transform()
@@ -180,21 +185,8 @@ class Movie:
                 for artist in moving:
                     figure.draw_artist(artist)
                     artist.remove()
+                progress(f"frame {k} of {len(times)}")
                 yield np.array(canvas.buffer_rgba())
-
-
-def write_movie(
-    movie: Movie, path: str | os.PathLike[str], progress: Callable[[str], None] = lambda text: None
-) -> None:
-    """Write a movie as GIF, or as MP4 by ffmpeg.
-
-    InputError if there is no ffmpeg for an MP4, or the file cannot be written.
-    """
-
-    def draw() -> Iterator[Array]:
-        for k, picture in enumerate(movie.draw(), start=1):
-            progress(f"frame {k} of {len(movie.times)}")
-            yield picture
 
     pictures = draw()
     if str(path).lower().endswith(".gif"):

@@ -30,7 +30,7 @@ from ..results.trajectory import Trajectory
 from ..search import solve
 from ..verification.verify import verify
 from . import page
-from .movie import Movie, write_movie
+from .movie import write_movie
 
 
 def build_report(
@@ -221,8 +221,8 @@ def write_gallery(
         progress(f"{name}: figure and movie")
         stem = os.path.join(folder, name)
         plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
-        movie = Movie(plan.problem, plan.trajectory, speed=plan.duration / 2.0, resolution=50)
-        write_movie(movie, f"{stem}.gif")
+        how: Any = {"speed": plan.duration / 2.0, "resolution": 50}
+        write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
         report = verify(plan.problem, plan)
         gap = "" if report.finger_gap is None else report.finger_gap.least
         forces = (contact.least for phase in report.phases for contact in phase.contacts)
