@@ -515,8 +515,8 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
     (study, *_) = PLANNERS[method].choices
     instance = phase(4, study != NO_DRAG)
     found = run_planner(instance, method, TRIED[method])
-    error, end, violation = found.errors
-    assert found.outcome == SOLVED and abs(error) < 2e-2
+    error, end, violation = found["errors"]
+    assert found["outcome"] == SOLVED and abs(error) < 2e-2
     assert end < 1e-2 and violation < 2.6e-2
     least = find_least_time(instance)
     assert least == pytest.approx(LEAST[study], rel=1e-5)
@@ -544,13 +544,12 @@ def course() -> Course:
 
 
 def test_reference_is_exact_and_meets_the_reversal() -> None:
-    problem, torque, spans, end = course()
-    rough, *_ = integrate(problem, torque, phase(1).curve, 1, 2.3e-12)
+    problem, torque, stretches, end = course()
+    rough, *_ = integrate(problem, torque, phase(1).curve, 2.3e-12)
     assert measure_error(problem, rough, end) < 1e-12
-    directions = {tuple(np.append(span.Xi, span.sigma)) for span in spans}
-    assert len(directions) == 2
-    ends = [span.stop for span in spans]
-    assert [span.start for span in spans] == [0.0, *ends[:-1]]
+    assert len({tuple(stretch[:6]) for stretch in stretches}) == 2  # Xi and sigma
+    starts, ends = np.array(stretches)[:, -2:].T
+    assert (starts[1:] == ends[:-1]).all() and starts[0] == 0.0
 
 
 @pytest.mark.parametrize("method", SIMULATORS)

@@ -731,28 +731,26 @@ def perturb_scenes(seed: int) -> None:
     k follows from the seed, the name of the number and its first 14 digits, to which the number
     is rounded first. So a scene that is made again from its own numbers keeps them.
     """
+
+    def change(kind: Any) -> None:
+        check = getattr(kind.__post_init__, "exact", kind.__post_init__)
+        names = [field.name for field in fields(kind) if field.init and field.name != "name"]
+
+        def check_and_perturb(self: Any) -> None:
+            # First as they were given: messages about bad numbers quote them.
+            given = {name: getattr(self, name) for name in names}
+            check(self)
+            for name, value in given.items():
+                label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
+                changed = None if value is None else _change(getattr(self, name), label)
+                object.__setattr__(self, name, changed)
+            check(self)
+
+        check_and_perturb.exact = check  # type: ignore[attr-defined]
+        kind.__post_init__ = check_and_perturb
+
     for kind in (Polygon, Finger, Friction, Scene):
-        _perturb(kind, seed)
-
-
-def _perturb(kind: Any, seed: int) -> None:
-    check = getattr(kind.__post_init__, "exact", kind.__post_init__)
-    names = [field.name for field in fields(kind) if field.init and field.name != "name"]
-
-    def check_and_perturb(self: Any) -> None:
-        # First as they were given: messages about bad numbers quote them.
-        given = [name for name in names if getattr(self, name) is not None]
-        left_out = set(names) - set(given)
-        check(self)
-        for name in left_out:
-            object.__setattr__(self, name, None)
-        for name in given:
-            label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
-            object.__setattr__(self, name, _change(getattr(self, name), label))
-        check(self)
-
-    check_and_perturb.exact = check  # type: ignore[attr-defined]
-    kind.__post_init__ = check_and_perturb
+        change(kind)
 
 
 def _change(value: Any, label: str) -> Any:

@@ -27,7 +27,7 @@ from importlib.util import find_spec
 from itertools import chain, pairwise, product
 from pathlib import Path
 from timeit import Timer
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -71,8 +71,6 @@ SIMULATION = FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies of simulators: torques in a few long pieces, and planned torques in eighty."""
 PLANNING = LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies of planners: all phases, and the same without viscous friction."""
-
-_Answer = TypeVar("_Answer")
 
 
 class Instance(NamedTuple):
@@ -137,36 +135,28 @@ class Method(NamedTuple):
     module: str = ""  # what has to be installed, if anything
 
 
-class Run(NamedTuple):
-    """What one setting takes, and what comes of it."""
+def measure(build: Callable[[], Any], judge: Callable[[Any], tuple[tuple[float, ...], str]]) -> Row:
+    """Build and run: `build` and `solve` are the times that takes [s], `judge` says the rest.
 
-    build: float  # build, solve [s]: time to build, and to simulate or solve
-    solve: float
-    # of the state, relative to the scene; of plans those of the phase time, of the replayed end
-    # state, and the worst violation of a limit between nodes
-    errors: tuple[float, ...]
-    outcome: str = SOLVED  # `SOLVED`, or what failed
-
-
-def measure(
-    build: Callable[[], Callable[[], _Answer]],
-    judge: Callable[[_Answer], tuple[tuple[float, ...], str]],
-) -> Run:
-    """Build and run; `judge` gives the errors and the outcome."""
+    These are the `errors`, of a simulation of the state, relative to the scene, of a plan those of
+    the phase time, of the replayed end state, and the worst violation of a limit between nodes; and
+    the `outcome`, `SOLVED` or what failed.
+    """
     with warnings.catch_warnings():
         # Warnings of peers are not ours.
         warnings.simplefilter("ignore")
         built, run = _time(build)
         took, answer = _time(run)
-    return Run(built, took, *judge(answer))
+    errors, outcome = judge(answer)
+    return {"build": built, "solve": took, "errors": errors, "outcome": outcome}
 
 
-def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
+def _time(work: Callable[[], Any]) -> tuple[float, Any]:
     """Mean processor time of as many runs as take 0.2 s, one at least [s], and the last answer.
 
     Other work on the machine hardly changes it.
     """
-    answers = deque[_Answer](maxlen=1)
+    answers = deque[Any](maxlen=1)
     timer = Timer(lambda: answers.append(work()), timer=time.process_time)
     count, seconds = timer.autorange()
     return seconds / count, answers[0]
@@ -207,22 +197,12 @@ def solve_motion(
     return np.asarray(solution[:5]), np.asarray(solution[5:])
 
 
-class Span(NamedTuple):
-    """A stretch of time within one piece of the torques, without a reversal."""
-
-    start: float  # start, stop [s]:
-    stop: float
-    piece: int  # of the torques
-    Xi: Array  # Xi, sigma (n_c,) and (2,): directions of sliding and of the joints
-    sigma: Array
-
-
 class Course(NamedTuple):
     """One phase with torques, and where it gets to."""
 
     problem: Problem  # of that phase alone
     torque: TorqueProfile
-    spans: tuple[Span, ...]
+    stretches: list[Array]  # as of `integrate`
     end: Array  # (10,): state (z, z') when the torques end
 
 
@@ -234,16 +214,21 @@ def measure_error(problem: Problem, state: Array, exact: Array) -> float:
 
 
 def integrate(
-    problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int, tolerance: float
-) -> tuple[Array, tuple[Span, ...], float]:
+    problem: Problem, torque: TorqueProfile, curve: Curve, tolerance: float
+) -> tuple[Array, list[Array], float]:
     """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
 
-    Contacts stay closed: those that are lost pull.
+    A stretch is in one piece of the torques, without a reversal: Xi, sigma, the coefficients of the
+    piece column by column, its ends, and those of the stretch. Contacts stay closed: those that are
+    lost pull.
     """
-    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments[: reversals + 1]]
-    y, spans, least = np.append(problem.start, np.zeros(5)), list[Span](), np.inf
+    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments]
+    y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
-        profile = torque.cut(t, stop)
+        profile, polynomial = (
+            torque.cut(t, stop),
+            [torque.coefficients[piece].ravel("F"), [t, stop]],
+        )
         while t < stop:
             part = parts[0]
 
@@ -261,9 +246,9 @@ def integrate(
             run = solve_ivp(rates, (t, stop), y, "DOP853", **options)
             least = min([least, *(solve(*at)[1].min() for at in zip(run.t, run.y.T, strict=True))])
             start, t, y = t, float(run.t[-1]), run.y[:, -1]
-            spans.append(Span(start, t, piece, part.Xi, part.sigma))
+            stretches.append(np.concatenate([part.Xi, part.sigma, *polynomial, [start, t]]))
             parts = parts[1:] if run.status == 1 else parts
-    return y, tuple(spans), float(least)
+    return y, stretches, float(least)
 
 
 def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:
@@ -318,15 +303,8 @@ def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
     options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
     options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
     step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
-    chain = step.mapaccum(len(course.spans))
-    columns = []
-    for span in course.spans:
-        polynomial = (
-            torque.coefficients[span.piece].ravel("F"),
-            torque.breaks[span.piece : span.piece + 2],
-        )
-        columns.append(np.concatenate([span.Xi, span.sigma, *polynomial, [span.start, span.stop]]))
-    start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(columns).T
+    chain = step.mapaccum(len(course.stretches))
+    start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(course.stretches).T
 
     def run() -> Array:
         states = chain(x0=start, p=parameters)["xf"]
@@ -345,11 +323,11 @@ SIMULATORS = {
 }
 
 
-def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Run | None:
-    """Run one setting of one simulator on one phase; None if the phase has no course."""
+def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Row:
+    """Run one setting of one simulator on one phase; nothing if the phase has no course."""
     course = make_course(instance, study)
     if course is None:
-        return None
+        return {}
 
     def judge(state: Array) -> tuple[tuple[float, ...], str]:
         error = measure_error(course.problem, state, course.end)
@@ -378,8 +356,8 @@ def make_course(instance: Instance, study: str) -> Course | None:
     breaks = np.append(breaks[breaks < stop], stop)
     torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
     # The smallest tolerance that SciPy takes.
-    end, spans, _ = integrate(problem, torque, curve, len(marks) - 2, 2.3e-14)
-    return Course(problem, torque, spans, end)
+    end, stretches, _ = integrate(problem, torque, curve, 2.3e-14)
+    return Course(problem, torque, stretches, end)
 
 
 def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
@@ -394,8 +372,7 @@ def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
     if isinstance(plan, str):
         return math.nan, math.nan, plan
     problem, curve = instance.problem, instance.curve
-    reversals = len(curve.segments) - 1
-    state, _, least = integrate(problem, plan, curve, reversals, 1e-10)
+    state, _, least = integrate(problem, plan, curve, 1e-10)
     end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
     limit = problem.scene.torque_limit
     places = np.cos(np.linspace(0.0, np.pi, 9))
@@ -425,7 +402,7 @@ def build_plant(formation: Formation) -> Expression:
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
 
 
-def run_planner(instance: Instance, method: str, setting: str) -> Run:
+def run_planner(instance: Instance, method: str, setting: str) -> Row:
     """Run one setting of one planner on one phase, and check its plans."""
     if module := PLANNERS[method].module:
         # No timing is to include the import.
@@ -498,22 +475,15 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
-    class Limits(LinearConstraint):  # type: ignore[misc]
-        """Limits with the internal force eliminated."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.identical = True
-            self.set_discretization_type(DiscretizationType.Interpolation)
-
-        def compute_constraint_params(self, *_: Any) -> Any:
-            return canlinear_colloc_to_interpolate(
-                a, b, constant, below, zero, None, None, grid, identical=True
-            )
-
+    # The parameters of the limits, with the internal force eliminated, are those of the grid.
+    limits, columns = LinearConstraint(), (a, b, constant, below, zero, None, None, grid)
+    limits.identical = True
+    limits.set_discretization_type(DiscretizationType.Interpolation)
+    parameters = canlinear_colloc_to_interpolate(*columns, identical=True)
+    limits.compute_constraint_params = lambda *_: parameters
     path = toppra.SplineInterpolator(grid, grid[:, None])
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
-    planner = toppra.algorithm.TOPPRA([Limits()], path, gridpoints=grid, **options)
+    planner = toppra.algorithm.TOPPRA([limits], path, gridpoints=grid, **options)
 
     def run() -> Plan:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
@@ -824,11 +794,10 @@ class Precision(Study):
         instances = list_instances(files, study != NO_DRAG)
         instance = next(instance for instance in instances if instance.name == name)
         if study in PLANNING:
-            measured: Run | None = run_planner(instance, method, setting)
+            measured = run_planner(instance, method, setting)
         else:
             measured = run_simulator(instance, study, method, setting)
-        row = dict(zip(self.columns[:4], case, strict=False))
-        return row if measured is None else row | measured._asdict()
+        return dict(zip(self.columns[:4], case, strict=False)) | measured
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """All tables."""

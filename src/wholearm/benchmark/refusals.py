@@ -58,18 +58,6 @@ class Trace(NamedTuple):
     reached: bool  # whether that is the phase's `until`
 
 
-def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
-    """Follow a phase's contacts from `z`, shape (5,), both ways."""
-
-    def equations(z: Array) -> tuple[Array, Array]:
-        gaps, rows = constrain(scene, phase, z[None])
-        return gaps[0], rows[0, : gaps.shape[1]]
-
-    closed = project(scene, z, equations)
-    z = z if closed is None else closed
-    return _march(scene, phase, z, 1.0), _march(scene, phase, z, -1.0)
-
-
 def weights(scene: Scene) -> Array:
     """Diagonal of the metric, shape (5,): an angle counts as it moves the object's rim [1, m^2]."""
     return np.array([1.0, 1.0, *[scene.scales.length**2] * 3])
@@ -99,8 +87,8 @@ def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
 
 
-def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
-    """Integrate the unit tangent up to the first event."""
+def follow(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
+    """Follow a phase's contacts from `z`, shape (5,), one way, up to the first event."""
     size, until, scale = scene.scales.length, phase.until, np.sqrt(weights(scene))
     near = OVERLAP * size
 
@@ -413,7 +401,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
-                follow(problem.scene, phase, z),
+                (follow(problem.scene, phase, z, way) for way in (1.0, -1.0)),
                 key=lambda trace: (trace.reached, -trace.length if trace.reached else trace.length),
             )
             if trace.length < 0.001 * problem.scene.scales.length:

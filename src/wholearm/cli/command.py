@@ -280,7 +280,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except WholearmError as error:
-        clear_progress()
         _complain(str(error))
         return error.exit_status
     except BrokenPipeError:
@@ -297,6 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _complain(text: str) -> None:
     try:
+        clear_progress()
         print(f"wholearm: {text}", file=sys.stderr, flush=True)
     except OSError:
         pass  # nobody reads it
@@ -548,7 +548,6 @@ def _solve(options: argparse.Namespace) -> int:
             plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
         table = None if make_table is None else make_table(plan)
     except WholearmError as error:
-        clear_progress()
         # Of bad input one line says everything.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
             if os.path.exists(path):
@@ -751,7 +750,6 @@ def find_route(
     from ..common.parallel import count_cores
 
     def warn(message: Warning | str, *_: object, **__: object) -> None:
-        clear_progress()
         _complain(f"warning: {message}")
 
     with warnings.catch_warnings():
@@ -769,7 +767,6 @@ def find_route(
 
 def hasten() -> None:
     """Say that the best route so far is being planned."""
-    clear_progress()
     _complain("planning the best route; again to stop")
 
 
@@ -918,7 +915,6 @@ def _policy(options: argparse.Namespace) -> int:
             say("looking for the widest ranges")
             each = find_widest(problem, plan, options.delay)
             made.about["largest"] = {str(number): factor for number, factor in each.items()}
-    clear_progress()
     failures = "; ".join(report.failures)
     if not report.ok and options.write_anyway:
         # The mark by which a program, or a reader of the file, knows.
