@@ -281,17 +281,17 @@ def test_an_end_at_rest_reached_at_speed_fails() -> None:
 def test_a_replay_far_from_its_plan_fails() -> None:
     """The plan of another motion: the torques carry the object, but elsewhere."""
     problem, trajectory = plan()
-    elsewhere = trajectory.q.copy()
+    elsewhere = trajectory.z.copy()
     shift = np.where(trajectory.phase == 2, 4e-4 * np.sin(trajectory.t), 0.0)
     elsewhere[:, 0] += shift
-    report = verify(problem, replace(trajectory, q=elsewhere))
+    report = verify(problem, replace(trajectory, z=elsewhere))
     (text,) = report.failures
     worst = float(np.abs(shift).max())
     time = float(trajectory.t[np.abs(shift).argmax()])
     length = problem.scene.scales.length
     assert text.startswith(f"phase 3 departs from the plan, by {worst:.2g} m and ")
     assert f" at t = {time:.5g} s; {1e-3 * length:.2g} m and 0.001 rad are allowed" in text
-    assert verify(problem, replace(trajectory, q=elsewhere), departure=0.02).ok
+    assert verify(problem, replace(trajectory, z=elsewhere), departure=0.02).ok
 
 
 @each("key", ["departure", "rest_speed"])

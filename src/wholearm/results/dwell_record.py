@@ -24,7 +24,7 @@ from ..common.arrays import Array, sort_unique
 from ..scene.model import Scene
 from .plan_record import ModeSpan
 from .torque import TorqueProfile
-from .trajectory import Motion, Samples, Trajectory, split_motion
+from .trajectory import Motion, Samples, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,9 @@ def assemble(
     z, z_dot, z_ddot, tau = (np.concatenate([row[k] for row in rows]) for k in range(4))
     c_n, c_t = np.concatenate(forces, axis=1)
     return Trajectory(
-        **split_motion(z, z_dot, z_ddot),
+        z=z,
+        z_dot=z_dot,
+        z_ddot=z_ddot,
         t=np.concatenate(times),
         tau=tau,
         c_n=c_n,

@@ -19,6 +19,8 @@ from ..common.files import read_arrays, require_ending, write_text, write_whole
 from .plan_record import ModeSpan
 from .torque import MOST, TorqueProfile, format_rows, place_rows
 
+_PARTS = slice(3), slice(3, 5)  # of z: q and theta
+
 
 class Samples(NamedTuple):
     """A motion at n instants, on one contact formation."""
@@ -46,6 +48,16 @@ class Motion(Protocol):
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
 
 
+class _Columns:
+    """Some columns of an array of a trajectory."""
+
+    def __init__(self, name: str, columns: slice) -> None:
+        self.name, self.columns = name, columns
+
+    def __get__(self, owner: Trajectory, _: type) -> Array:
+        return np.asarray(getattr(owner, self.name)[:, self.columns])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Drawn):
     """A planned motion: samples for files and plots, motions for any instant."""
@@ -53,12 +65,9 @@ class Trajectory(Drawn):
     # (n,) [s]: even within each phase of a plan; a time is there twice where torques and forces
     # step: between phases, where the end of one begins to be held, and anywhere in a replay
     t: Array
-    q: Array  # (n, 3) [m, m, rad]
-    theta: Array  # (n, 2) [rad]
-    q_dot: Array  # first and second derivatives with respect to time
-    theta_dot: Array
-    q_ddot: Array
-    theta_ddot: Array
+    z: Array  # z, z_dot, z_ddot (n, 5): degrees of freedom (q, theta) and their derivatives
+    z_dot: Array
+    z_ddot: Array
     tau: Array  # (n, 2) [N m]
     contacts: tuple[str, ...]  # every contact of the plan
     # (n, m) [N]: NaN where a contact is not in the formation, or at rest, where none is determined
@@ -70,6 +79,11 @@ class Trajectory(Drawn):
     # those of a loaded one interpolate the samples.
     motions: tuple[Motion, ...]
     meta: Mapping[str, Any]  # status, epsilon, the problem, and of a plan all else that it says
+
+    # q: pose of the centroid, (n, 3) [m, m, rad]; theta: joint angles, (n, 2) [rad]
+    q, theta = (_Columns("z", part) for part in _PARTS)
+    q_dot, theta_dot = (_Columns("z_dot", part) for part in _PARTS)
+    q_ddot, theta_ddot = (_Columns("z_ddot", part) for part in _PARTS)
 
     @property
     def headline(self) -> str:
@@ -105,21 +119,6 @@ class Trajectory(Drawn):
                 rows = (passed >= mode["start"]) & (passed <= mode["stop"])
                 mask[rows] |= [mode["contacts"].get(name) == "rolls" for name in self.contacts]
         return mask
-
-    @property
-    def z(self) -> Array:
-        """Degrees of freedom (q, theta), shape (n, 5)."""
-        return np.hstack([self.q, self.theta])
-
-    @property
-    def z_dot(self) -> Array:
-        """Velocities (q', theta'), shape (n, 5)."""
-        return np.hstack([self.q_dot, self.theta_dot])
-
-    @property
-    def z_ddot(self) -> Array:
-        """Accelerations (q'', theta''), shape (n, 5)."""
-        return np.hstack([self.q_ddot, self.theta_ddot])
 
     def at(self, t: ArrayLike) -> Samples:
         """The motion at some times, shape (n,) or a number [s], each field of shape (n, ...).
@@ -239,29 +238,17 @@ def interpolate_quintic(
     )
 
 
-_DOTS = ("", "_dot", "_ddot")
-
-
-def split_motion(z: Array, z_dot: Array, z_ddot: Array) -> dict[str, Array]:
-    """Degrees of freedom and their derivatives, (n, 5) each, as a `Trajectory` names its arrays."""
-    pairs = zip(_DOTS, (z, z_dot, z_ddot), strict=True)
-    parts = ("q", slice(3)), ("theta", slice(3, 5))
-    return {f"{name}{dots}": of[:, part] for dots, of in pairs for name, part in parts}
-
-
 def sample_phases(
-    arrays: Mapping[str, Any], contacts: tuple[str, ...]
+    t: Array, phase: NDArray[np.int64], samples: Samples, contacts: tuple[str, ...]
 ) -> tuple[SampledMotion, ...]:
-    """The motion of each phase, from the arrays of a trajectory by name."""
+    """The motion of each phase, from all samples of a trajectory."""
     motions = []
-    for index in sort_unique(arrays["phase"]):
-        parts = {name: array[arrays["phase"] == index] for name, array in arrays.items()}
-        held = ~np.isnan(parts["c_n"]).all(axis=0)
-        pairs = ((parts[f"q{dots}"], parts[f"theta{dots}"]) for dots in _DOTS)
-        z, z_dot, z_ddot = map(np.hstack, pairs)
-        forces = parts["tau"], parts["c_n"][:, held], parts["c_t"][:, held]
-        contact_names = tuple(compress(contacts, held))
-        motions.append(SampledMotion(parts["t"], contact_names, Samples(z, z_dot, z_ddot, *forces)))
+    for index in sort_unique(phase):
+        rows = phase == index
+        parts = [values[rows] for values in samples]
+        held = ~np.isnan(parts[4]).all(axis=0)
+        own = Samples(*parts[:4], *(forces[:, held] for forces in parts[4:]))
+        motions.append(SampledMotion(t[rows], tuple(compress(contacts, held)), own))
     return tuple(motions)
 
 
@@ -302,10 +289,12 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         text = "is not a list of spans with start, stop, contacts and joints for each phase"
         raise InputError(source, "meta.modes", text) from None
     contacts = tuple(str(name) for name in arrays["contacts"])
-    samples = {name: arrays[name] for name in _ARRAYS}
+    pairs = ((arrays[f"q{dots}"], arrays[f"theta{dots}"]) for dots in ("", "_dot", "_ddot"))
+    samples = Samples(*map(np.hstack, pairs), *(arrays[name] for name in ("tau", "c_n", "c_t")))
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
-    motions = sample_phases(samples, contacts)
-    return Trajectory(**samples, contacts=contacts, torque=torque, motions=motions, meta=meta)
+    motions = sample_phases(arrays["t"], arrays["phase"], samples, contacts)
+    columns = samples._asdict() | {"t": arrays["t"], "phase": arrays["phase"]}
+    return Trajectory(**columns, contacts=contacts, torque=torque, motions=motions, meta=meta)
 
 
 def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:

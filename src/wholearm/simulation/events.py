@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from ..common.document import Drawn
 from ..common.errors import SimulationError
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory, sample_phases, split_motion
+from ..results.trajectory import Samples, Trajectory, sample_phases
 from .stepper import ModeStepper
 
 
@@ -180,10 +180,9 @@ class Simulation(Drawn):
         if not chosen:
             raise SimulationError(f"there is no motion to keep: {self.outcome.text}")
         rows = np.concatenate(chosen)
-        names = ("t", "tau", "c_n", "c_t", "phase")
-        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
-        arrays |= split_motion(self.z[rows], self.z_dot[rows], self.z_ddot[rows])
-        motions = sample_phases(arrays, self.contacts)
+        t, phases = self.t[rows], self.phase[rows]
+        samples = Samples(*(getattr(self, name)[rows] for name in Samples._fields))
+        motions = sample_phases(t, phases, samples, self.contacts)
         rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
         meta = {
             "status": "replayed",
@@ -194,9 +193,8 @@ class Simulation(Drawn):
             "phase_durations": [motion.duration for motion in motions],
             "problem": problem.table,
         }
-        return Trajectory(
-            **arrays, contacts=self.contacts, torque=self.torque, motions=motions, meta=meta
-        )
+        arrays = samples._asdict() | {"t": t, "phase": phases, "contacts": self.contacts}
+        return Trajectory(**arrays, torque=self.torque, motions=motions, meta=meta)
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
         """Events of one kind, in the order of time."""
