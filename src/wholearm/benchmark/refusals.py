@@ -38,6 +38,7 @@ from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_ar
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
 from ..mechanics import UNIQUENESS
+from ..mechanics.dynamics import metric_weights
 from ..planning.plan import solve
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
@@ -58,11 +59,6 @@ class Trace(NamedTuple):
     reached: bool  # whether that is the phase's `until`
 
 
-def weights(scene: Scene) -> Array:
-    """Diagonal of the metric, shape (5,): an angle counts as it moves the object's rim [1, m^2]."""
-    return np.array([1.0, 1.0, *[scene.scales.length**2] * 3])
-
-
 def project(
     scene: Scene, z: Array, equations: Callable[[Array], tuple[Array, Array]]
 ) -> Array | None:
@@ -70,7 +66,7 @@ def project(
 
     `equations` gives their values, shape (m,), and rows of their Jacobian, (m, 5).
     """
-    scale, size = np.sqrt(weights(scene)), scene.scales.length
+    scale, size = np.sqrt(metric_weights(scene)), scene.scales.length
     for _ in range(20):
         miss, rows = equations(z)
         step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ miss / scale
@@ -89,7 +85,7 @@ def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
 
 def follow(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     """Follow a phase's contacts from `z`, shape (5,), one way, up to the first event."""
-    size, until, scale = scene.scales.length, phase.until, np.sqrt(weights(scene))
+    size, until, scale = scene.scales.length, phase.until, np.sqrt(metric_weights(scene))
     near = OVERLAP * size
 
     def tangents(z: Array) -> Array:
@@ -492,7 +488,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     first = project_end(z) if first is None else first
     if first is None:
         return np.zeros((0, 5))
-    scale, far = np.sqrt(weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
+    scale, far = np.sqrt(metric_weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
     tangent = np.linalg.svd(_end_equations(scene, phase, first)[1] / scale)[2][-1] / scale
     steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
     others = [project_end(first + step * tangent) for step in steps]
@@ -563,7 +559,7 @@ def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
 
 
 def _find_margin(scene: Scene, phase: Phase, epsilon: float, z: Array) -> float:
-    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ weights(scene))
+    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ metric_weights(scene))
     if runs.min() < 1e-6 * scene.scales.length:
         return -np.inf
     s = np.append(0.0, np.cumsum(runs))

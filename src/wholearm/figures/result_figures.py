@@ -23,9 +23,10 @@ from ..common.document import show
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..planning.options import Objective
+from ..verification.newton_euler import place_object
 from . import style
 from .plots import draw_margins, draw_phases
-from .snapshots import place_vertices, trace_link
+from .snapshots import trace_link
 
 if TYPE_CHECKING:
     from ..analysis.comparison import Comparison
@@ -180,10 +181,11 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
         path = np.array(record["path"])
         colour = _KINDS[find_kind(record)][1]
         axes.plot(*(1e3 * path[:, :2].T), color=colour, linewidth=0.6, alpha=0.5, zorder=3)
-        body = Polygon(1e3 * place_vertices(scene, path[-1]), fill=False, ec=colour)
+        body = Polygon(1e3 * place_object(scene, path[-1:])[0], fill=False, ec=colour)
         axes.add_patch(body).set(linewidth=0.5, alpha=0.35, zorder=2)
-    for z, dash in ((nominal[0], (0, (4, 2))), (nominal[-1], "-")):
-        body = Polygon(1e3 * place_vertices(scene, z), fill=False, ec=style.INK, linestyle=dash)
+    ends = place_object(scene, nominal[[0, -1]])
+    for corners, dash in zip(ends, ((0, (4, 2)), "-"), strict=True):
+        body = Polygon(1e3 * corners, fill=False, ec=style.INK, linestyle=dash)
         axes.add_patch(body).set(linewidth=1.2, zorder=5)
     axes.plot(*(1e3 * nominal[:, :2].T), color=style.INK, linewidth=1.6, zorder=4)
     axes.autoscale_view()

@@ -22,7 +22,7 @@ from ..common.document import fixed
 from ..contacts.elemental import parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
-from ..verification.newton_euler import locate
+from ..verification.newton_euler import locate, place_object
 from .style import BODY, FINGERS, INK, PALM, Styles, add_line, inset, write
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
@@ -44,7 +44,7 @@ def draw_snapshot(
     """
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="datalim")
-    vertices = place_vertices(scene, z)
+    (vertices,) = place_object(scene, z[None])
     bases = [np.asarray(finger.base)[0] for finger in scene.fingers]
     ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
     artists = [draw_palm(axes, scene, ends.min(), ends.max()), *draw_bodies(axes, scene, z)]
@@ -75,7 +75,7 @@ def draw_palm(axes: Axes, scene: Scene, left: float, right: float) -> Artist:
 def draw_bodies(axes: Axes, scene: Scene, z: Array, **look: Any) -> list[Artist]:
     """Draw both links and the object."""
     shapes = [trace_link(f, angle) for f, angle in zip(scene.fingers, z[3:].tolist(), strict=True)]
-    shapes.append(place_vertices(scene, z))
+    shapes += [*place_object(scene, z[None])]
     artists: list[Artist] = []
     looks = (*((*colours, 0.9, 2) for colours in FINGERS), (INK, BODY, 1.1, 4))
     for points, (line, face, wide, above) in zip(shapes, looks, strict=True):
@@ -139,11 +139,6 @@ def choose_numbers(
     )
     every = next(fitting, range(0))
     return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
-
-
-def place_vertices(scene: Scene, z: Array) -> Array:
-    """World positions of the object's vertices, shape (n_v, 2) [m]."""
-    return turn(z, scene.polygon.vertices)
 
 
 def turn(z: Array, points: Array) -> Array:
@@ -247,7 +242,7 @@ def draw_strip(
 
 def measure_box(scene: Scene, z: Array) -> Array:
     """Corners of the box around hand and object at configurations, (n, 5); shape (2, 2) [m]."""
-    every = [place_vertices(scene, row) for row in z]
+    every = [*place_object(scene, z)]
     for finger, angles in zip(scene.fingers, z[:, 3:].T, strict=True):
         every += [trace_link(finger, angle) for angle in angles.tolist()]
     points = np.concatenate(every)
