@@ -237,18 +237,6 @@ def _parse(text: str) -> Any:
     return text
 
 
-def name_parameter(problem: Problem, name: str, values: Sequence[Any]) -> str:
-    """A parameter with its unit; raises an `InputError` if no file may have one of its values."""
-    parameter = Parameter(name, (name, *name_keys().get(name, ())), math.nan, "")
-    if all(isinstance(value, Real) for value in values):
-        values = min(values), max(values)
-    for value in values:
-        require_allowed(problem, parameter, value, "--vary")
-    with suppress(InputError):
-        return find_parameter(problem, name).title
-    return name
-
-
 def sweep(
     problems: Problem | Sequence[Problem],
     vary: Mapping[str, Sequence[Any]],
@@ -292,8 +280,14 @@ def sweep(
     goal = PlanOptions(**chosen).goal
     axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
-    for problem in listed[::-1]:
-        titles = {name: name_parameter(problem, name, values) for name, values in axes.items()}
+    for problem, (name, given) in product(listed[::-1], axes.items()):
+        parameter = Parameter(name, (name, *name_keys().get(name, ())), math.nan, "")
+        numbers = all(isinstance(value, Real) for value in given)
+        for value in (min(given), max(given)) if numbers else given:
+            require_allowed(problem, parameter, value, "--vary")
+        titles[name] = name
+        with suppress(InputError):
+            titles[name] = find_parameter(problem, name).title
     names = [problem.source or problem.name for problem in listed]
     if len({*names}) < len(names):
         names = [f"{name} ({k})" for k, name in enumerate(names, start=1)]
