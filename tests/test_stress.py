@@ -86,8 +86,7 @@ def test_values_that_noise_changes_are_found() -> None:
 
 def reach(scene: Scene, phase: Phase, start: Array) -> Trace:
     """The way from there that reaches the end of a phase."""
-    traces = (follow(scene, phase, start, way) for way in (1.0, -1.0))
-    (reached,) = (trace for trace in traces if trace.reached)
+    (reached,) = (way for way in follow(scene, phase, start) if way.reached)
     return reached
 
 
@@ -96,7 +95,7 @@ def test_small_steps_end_where_the_curve_does(
     heptagon: Problem, curves: tuple[Curve, ...], index: int
 ) -> None:
     phase = heptagon.phases[index]
-    ways = [follow(heptagon.scene, phase, curves[index].start, way) for way in (1.0, -1.0)]
+    ways = follow(heptagon.scene, phase, curves[index].start)
     (reached,) = (way for way in ways if way.reached)
     assert np.abs(reached.end - curves[index].end).max() < 1e-5
     assert {way.ending for way in ways if not way.reached} <= {

@@ -59,6 +59,19 @@ class Trace(NamedTuple):
     reached: bool  # whether that is the phase's `until`
 
 
+def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
+    """Follow a phase's contacts from `z`, shape (5,), both ways."""
+
+    def equations(z: Array) -> tuple[Array, Array]:
+        gaps, rows = constrain(scene, phase, z[None])
+        return gaps[0], rows[0, : gaps.shape[1]]
+
+    # The phase before ends where bodies overlap by `OVERLAP`.
+    closed = project(scene, z, equations)
+    z = z if closed is None else closed
+    return _march(scene, phase, z, 1.0), _march(scene, phase, z, -1.0)
+
+
 def project(
     scene: Scene, z: Array, equations: Callable[[Array], tuple[Array, Array]]
 ) -> Array | None:
@@ -83,8 +96,8 @@ def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
 
 
-def follow(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
-    """Follow a phase's contacts from `z`, shape (5,), one way, up to the first event."""
+def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
+    """Integrate the unit tangent up to the first event."""
     size, until, scale = scene.scales.length, phase.until, np.sqrt(metric_weights(scene))
     near = OVERLAP * size
 
@@ -397,7 +410,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
-                (follow(problem.scene, phase, z, way) for way in (1.0, -1.0)),
+                follow(problem.scene, phase, z),
                 key=lambda trace: (trace.reached, -trace.length if trace.reached else trace.length),
             )
             if trace.length < 0.001 * problem.scene.scales.length:
