@@ -254,7 +254,9 @@ def try_phases(
     for guess in listed:
         solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
         if solution.success:
-            search, solution = choose_end(search, solution)
+            # Of six stages of phase 3 of goal 19 of the corpus three have vanished; no plan is found
+            # from all of them.
+            search, solution = choose_end(search, drop_gone(search, solution))
             first, *others = list_plans(search, solution._replace(attempt=guess.name))
             return [first._replace(complete=not options.mode_search), *others]
     return None
