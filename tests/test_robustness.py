@@ -195,7 +195,7 @@ def follow(
         outcome=SimpleNamespace(kind=None, text=""),
     )
     simulation.list_pauses = partial(Simulation.list_pauses, simulation)
-    return trial.judge(simulation)
+    return trial.judge(simulation, 0.0, [window.stop for window in windows])
 
 
 ONE = (TimeWindow(1, 1.0, ("a", "b"), {"c", "d"}, {}),)

@@ -37,7 +37,7 @@ from wholearm.planning.replay_check import (
 from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import Balance, balance
-from wholearm.verification.verdict import Allowance, find_least_force
+from wholearm.verification.verdict import STRAY, Allowance, find_least_force, measure_stray
 from wholearm.verification.verify import list_normal_forces, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
@@ -475,9 +475,9 @@ def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
     least = np.nanmin(fine.c_n)
     lowest = int(np.where(np.isnan(fine.c_n), np.inf, fine.c_n).min(axis=1).argmin())
     assert least > 0.0 and start < fine.t[lowest] < stop
-    rounding = Allowance().measure_stray(problem) - Allowance().stray * problem.epsilon
+    rounding = measure_stray(problem) - STRAY * problem.epsilon
     for more, fails in (1e-3, True), (-1e-3, False):
-        epsilon = (least + rounding) / (1 - Allowance().stray - more)
+        epsilon = (least + rounding) / (1 - STRAY - more)
         texts = verify(problem.with_(epsilon=epsilon), torque).warnings
         assert any(" falls to " in text for text in texts) is fails
 
@@ -610,6 +610,6 @@ def test_a_contact_that_is_let_go_counts_until_then() -> None:
     phase = report.phases[0]
     assert phase.until == "release of v3-finger1"
     margins = {margin.contact: margin for margin in phase.contacts}
-    assert margins["v3-finger1"].least > problem.epsilon - Allowance().measure_stray(problem)
+    assert margins["v3-finger1"].least > problem.epsilon - measure_stray(problem)
     assert find_least_force(phase) == min(phase.contacts, key=lambda margin: margin.least)
     assert find_least_force(phase._replace(contacts=())) is None

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -26,7 +26,7 @@ from ..common.fields import Field, Range
 from ..common.journal import Journal
 from ..common.parallel import DiedError, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
-from ..policy.playback import ROOM, ClosedLoop, Policy
+from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import PARAMETERS, Problem, change_scene, read_widths
 from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
@@ -143,7 +143,6 @@ class TimeWindow(NamedTuple):
     contacts: tuple[str, ...]  # that it is planned with
     gained: Collection[str]  # that it ends with, as of `list_gained`
     aliases: Mapping[str, set[str]]  # as of `list_aliases`
-    start: float = 0.0  # [s]: of the first window
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,15 +192,14 @@ class Trial:
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
         if not isinstance(what, ClosedLoop):
-            return self.judge(simulation, changes.get("delay", 0.0))
+            late = changes.get("delay", 0.0)
+            return self.judge(simulation, 0.0, [window.stop + late for window in self.windows])
         # A phase begins when its first torques take effect; the last one goes on to the end.
-        end, windows = float(simulation.t[-1]), list[TimeWindow]()
+        end = float(simulation.t[-1])
         began = {number: time + what.delay for number, time in what.began.items()}
         began[self.windows[-1].phase + 1] = end
-        for window in self.windows:
-            start, stop = began.get(window.phase, end), began.get(window.phase + 1, math.inf)
-            windows.append(window._replace(start=start, stop=stop))
-        return replace(self, windows=tuple(windows)).judge(simulation)
+        stops = [began.get(window.phase + 1, math.inf) for window in self.windows]
+        return self.judge(simulation, began.get(self.windows[0].phase, end), stops)
 
     def simulate(
         self,
@@ -220,15 +218,17 @@ class Trial:
             raise SimulationError(f"the hand cannot close at the start: {text}")
         until = None
         if isinstance(torque, ClosedLoop):
-            until = (1 + ROOM) * torque.find_duration(self.windows[-1].phase)
+            until = torque.find_limit(self.windows[-1].phase)
         return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
-    def judge(self, simulation: FreeSimulation, delay: float = 0.0) -> dict[str, Any]:
-        """Compare a motion with the plan; as `run`."""
+    def judge(
+        self, simulation: FreeSimulation, start: float, stops: Sequence[float]
+    ) -> dict[str, Any]:
+        """Compare a motion, and when its phases start and stop [s], with the plan; as `run`."""
         off = simulation.z[-1, :3] - self.goal
         distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
         given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
-        lost, phase, time, least = self._follow(simulation, delay)
+        lost, phase, time, least = self._follow(simulation, start, stops)
         even = np.linspace(0.0, simulation.t[-1], 24)
         path = np.column_stack([np.interp(even, simulation.t, column) for column in simulation.z.T])
         near = distance <= self.uncertainty.find_distance(self.problem.scene)
@@ -240,7 +240,7 @@ class Trial:
         return ends | verdict | loss | {"path": path.tolist(), "ended": ended}
 
     def _follow(
-        self, simulation: FreeSimulation, delay: float
+        self, simulation: FreeSimulation, began: float, stops: Sequence[float]
     ) -> tuple[str, int | None, float | None, float]:
         """The first planned contact that is lost, its phase and when, and the least c_n.
 
@@ -249,11 +249,10 @@ class Trial:
         is open at the start, which may be off, has `MOMENT` to close for good.
         """
         unit, t = self.problem.scene.scales.time, simulation.t
-        began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
-        for window in self.windows:
+        losses, least = list[tuple[float, int, str]](), math.inf
+        for window, planned in zip(self.windows, stops, strict=True):
             gains = [s.start for s in simulation.stretches if s.contact in window.gained]
             gain = min((time for time in gains if time > began), default=math.inf)
-            planned = window.stop + delay
             stop = min(planned, find_touch(simulation, window.gained, began))
             for name in window.contacts:
                 c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
@@ -291,9 +290,8 @@ def make_trial(
     count = len(starts) - 1
     if phase is not None and not 1 <= phase <= count:
         raise InputError("", "--phase", f"{phase} given; the plan has phases 1 to {count}")
-    if policy is not None and policy.count != count:
-        text = f"{policy.count} given; the plan has {count}"
-        raise InputError("", "phases of the policy", text)
+    if policy is not None:
+        policy.require_count(count, "plan")
     first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
     rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))
     scales = problem.scene.scales

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
-from ..policy.playback import ROOM, ClosedLoop, Policy
+from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Samples, Trajectory
@@ -428,9 +428,7 @@ def play_policy(
     """
     problem, plan = adopt_motion(problem, plan)
     play = require_engine(engine)
-    if policy.count != len(problem.phases):
-        fault = f"{policy.count} given; the problem has {len(problem.phases)}"
-        raise InputError("", "phases of the policy", fault)
+    policy.require_count(len(problem.phases), "problem")
     info = ENGINES[engine]
     setting = setting or Setting()
     arrivals = []
@@ -442,7 +440,7 @@ def play_policy(
             progress(f"phase {stretch.name} in {info.title}")
         last = stretch.phases[-1] + 1
         loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
-        until = stretch.start + (1 + ROOM) * loop.find_duration(last)
+        until = stretch.start + loop.find_limit(last)
         run = play(problem, stretch._replace(stop=until), loop, setting)
         arrivals.append(_judge(problem, plan, stretch, loop, run))
     title = f"{info.title} {version(engine)}"

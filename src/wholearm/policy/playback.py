@@ -136,6 +136,12 @@ class Policy(Result):
         """Number of phases."""
         return sum(len(law.starts) for law in self.laws[: self.last + 1])
 
+    def require_count(self, count: int, of: str) -> None:
+        """InputError if it has another number of phases than a problem or a plan, as `of` says."""
+        if self.count != count:
+            text = f"{self.count} given; the {of} has {count}"
+            raise InputError("", "phases of the policy", text)
+
     @property
     def phase(self) -> int:
         """Number of the present phase, from 1."""
@@ -297,9 +303,6 @@ def _read_tables(
     return tables
 
 
-ROOM = 1.0  # time that a simulation goes on after the policy's own, over that
-
-
 class ClosedLoop:
     """Feedback of a simulation; a `simulation.run.Law`.
 
@@ -334,10 +337,10 @@ class ClosedLoop:
         last = self.policy.last
         return self.policy.index == last and self.policy.laws[last].over
 
-    def find_duration(self, last: int) -> float:
-        """Nominal duration of the phases up to the `last` [s], the first one's contact open."""
+    def find_limit(self, last: int) -> float:
+        """How long to simulate phases up to the `last` [s], the first one's contact open: twice."""
         phases = self.policy.about["phases"][self.first - 1 : last]
-        return 0.05 + sum(float(phase["duration"]) for phase in phases)
+        return 2 * (0.05 + sum(float(phase["duration"]) for phase in phases))
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]

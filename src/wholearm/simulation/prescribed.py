@@ -79,22 +79,19 @@ def _interpolate_stages() -> tuple[Array, Array]:
 _PLACES, _INSIDE = _interpolate_stages()
 
 
-class LegRows(NamedTuple):
-    """Where event values of a leg after those of `EventRows.force` and `cone` are; scaled."""
+class ModeSegment(NamedTuple):
+    """A part of a phase with one set of contact modes.
 
+    Its event values, scaled, are those of `EventRows.force` and `cone`, and then these.
+    """
+
+    mode: modes.Mode
     turning: slice  # sliding velocities times Xi, then joint speeds times sigma
     limit: slice  # the formation's limits; that of the contact to be gained counts as `until`
     until: int  # distance to the end of the phase; one if that is a release
     # speed along the heading, in the metric M5; one with more than one freedom, where contacts and
     # joints come to rest one by one
     speed: int
-
-
-class ModeSegment(NamedTuple):
-    """A part of a phase with one set of contact modes."""
-
-    mode: modes.Mode
-    rows: LegRows
     slack: Array  # (m,): how far below zero each event value counts as rounding
     # sets `event_values` from outputs of the steps and the `heading` at their start
     measure: Any
@@ -116,8 +113,7 @@ def _build_leg(
     limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
     last = layout.slide.stop + 2
     until_row = last + len(limits)
-    turning, limit = slice(layout.slide.start, last), slice(last, until_row)
-    rows = LegRows(turning, limit, until_row, until_row + 1)
+    rows = slice(layout.slide.start, last), slice(last, until_row), until_row, until_row + 1
     sizes = [layout.cone.stop, last - layout.cone.stop, len(limits), 1, 1]
     # Of speeds 2e-13 is rounding.
     slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
@@ -149,7 +145,7 @@ def _build_leg(
     start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
     measure = bind(function, [s.outputs, start], event_values)
     texts = [limit.text for limit in limits]
-    return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
+    return ModeSegment(mode, *rows, slack, measure, start, event_values, unit_until, texts)
 
 
 class Stop(Enum):
@@ -336,25 +332,18 @@ class Replay(Run):
             if progress is not None:
                 progress(f"simulating phase {phase.number} of {len(phases)}")
             try:
-                outcome = self._play(phase, following)
+                self.enter(phase, following)
+                ending = (self.go_on() or self.move()) if self.moving else self._rest()
+                while ending is Stop.REST:
+                    ending = self._rest()
             except (JammingError, SimulationError) as error:
                 error.phase = phase.number
                 raise
-            if outcome is not None:
-                return outcome, math.nan if phase.until.is_release else self.distance
+            if isinstance(ending, Outcome):
+                return ending, math.nan if phase.until.is_release else self.distance
         goal = phases[-1].until
         text = f"{goal} is reached at t = {self.t:.5g} s, the end of phase {len(phases)}"
         return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
-
-    def _play(self, phase: Phase, following: Phase | None) -> Outcome | None:
-        """Simulate one phase; None if its end is reached."""
-        self.enter(phase, following)
-        ending: Ending = Stop.REST
-        if self.moving:
-            ending = self.go_on() or self.move()
-        while ending is Stop.REST:
-            ending = self._rest()
-        return ending if isinstance(ending, Outcome) else None
 
     def _arrive(self, window: float) -> Ending:
         """End the phase; if it ends at rest the motion stops, with a plastic impact if need be.
@@ -552,21 +541,21 @@ class Replay(Run):
 
     def handle(self, kinds: Sequence[int]) -> Ending | None:
         """End the motion at events, or go on."""
-        rows = self.leg.rows
-        if rows.until in kinds:
+        leg = self.leg
+        if leg.until in kinds:
             return self._reach()
-        if rows.speed in kinds:
+        if leg.speed in kinds:
             return self.come_to_rest()
         pulling = [k for k in kinds if k < self.s.rows.force.stop]
         if pulling:
             return self.let_go(pulling)
-        cone, limit, mode = self.s.rows.cone, rows.limit, self.leg.mode
+        cone, limit, mode = self.s.rows.cone, leg.limit, leg.mode
         bounds = [k - cone.start for k in kinds if cone.start <= k < cone.stop]
         if any(mode.declares(k % len(mode.holders)) for k in bounds):
             return self.slip()
         reached = [] if bounds else [k for k in kinds if limit.start <= k < limit.stop]
         if reached:
-            text = self.note(EventKind.LIMIT, self.leg.limits[reached[0] - limit.start])
+            text = self.note(EventKind.LIMIT, leg.limits[reached[0] - limit.start])
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
@@ -744,7 +733,7 @@ class Replay(Run):
             self.signs = signs
             return False
         self.look()
-        slow = np.abs(self.values[self.leg.rows.turning]) < STANDING
+        slow = np.abs(self.values[self.leg.turning]) < STANDING
         still = [
             unit
             for unit in modes.list_units(formation)
@@ -819,7 +808,7 @@ class Replay(Run):
 
     def _find_turning(self, events: Sequence[int]) -> list[int]:
         """Contacts, then joints, whose sliding or turning is among events."""
-        turning = self.leg.rows.turning
+        turning = self.leg.turning
         return [k - turning.start for k in events if turning.start <= k < turning.stop]
 
     def _measure_reserves(self) -> dict[int, float]:
@@ -859,13 +848,11 @@ class Replay(Run):
                 if self.steps_at[self.piece]:
                     break
             self.note(EventKind.TORQUE_STEP, "the torques step")
-        elif self._goes_on(longest):
-            return False
         else:
             self.start = self.values
             stretch = min(window, self.stop - self.t)
             self.step_to(stretch)
-            rows = self._find_turning(self.find_first(stretch, self.leg.rows.turning))
+            rows = self._find_turning(self.find_first(stretch, self.leg.turning))
             if not rows:
                 self.look()
                 return False
@@ -875,15 +862,6 @@ class Replay(Run):
         if not ended:
             self.observe()
         return ended
-
-    def _goes_on(self, longest: float) -> bool:
-        """Whether all that slides or turns is far too fast to rest in a time, over the scene's."""
-        out, units = self.s.outputs, self.system.units[5:]
-        fastest = np.abs(out[5:10] / units).max()
-        strongest = np.abs(out[self.s.to.acceleration] / units).max() * self.system.scales.time
-        # Lever arms are below 100 units of the scene.
-        least = 100 * longest * (strongest + fastest**2)
-        return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
 
     def note_change(self, row: int, before: float, after: float) -> None:
         """Record that a contact or joint sticks, slips or turns back."""

@@ -19,7 +19,7 @@ from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import list_renamed
 from ..geometry.curve import describe_pose
-from ..policy.playback import ROOM, ClosedLoop, Policy
+from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
@@ -76,7 +76,14 @@ def verify_free(
         alone += compared
         title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
         warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
-        failures += _fail(part, compared, allowed)
+        failures += [] if part.outcome.kind is OutcomeKind.ENDED else [part.outcome.text]
+        for phase in compared:
+            title, end = f"phase {phase.number} alone", phase.deviation
+            failures += [f"{title}: {loss.describe()}" for loss in phase.losses]
+            assert end is not None
+            if measure_departure(end, problem.scene.scales.length) > allowed:
+                away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
+                failures.append(f"{title} ends {away}")
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
     both = tuple(alone), tuple(by_clock)
     return FreeReport(problem.name, whole, *both, tuple(failures), tuple(warnings))
@@ -108,12 +115,12 @@ def verify_policy(
     """
     problem, plan = adopt_motion(problem, plan)
     allowed = require_number(departure, "departure", positive=True)
-    count = len(problem.phases)
-    for name, given in (("policy", policy.count), ("plan", len(plan.phase_starts) - 1)):
-        if given != count:
-            raise InputError("", f"phases of the {name}", f"{given} given; the problem has {count}")
+    count, planned = len(problem.phases), len(plan.motions)
+    policy.require_count(count, "problem")
+    if planned != count:
+        raise InputError("", "phases of the plan", f"{planned} given; the problem has {count}")
     loop = ClosedLoop(policy)
-    until = (1 + ROOM) * loop.find_duration(count)
+    until = loop.find_limit(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
     phases, moment = list[FreePhase](), MOMENT * problem.scene.scales.time
@@ -141,19 +148,6 @@ def verify_policy(
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
     return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), tuple(warnings))
-
-
-def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:
-    """Why phases from rest are not as planned."""
-    texts = [] if simulation.outcome.kind is OutcomeKind.ENDED else [simulation.outcome.text]
-    for phase in phases:
-        alone, end = f"phase {phase.number} alone", phase.deviation
-        texts += [f"{alone}: {loss.describe()}" for loss in phase.losses]
-        assert end is not None
-        if measure_departure(end, simulation.problem.scene.scales.length) > allowed:
-            away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
-            texts.append(f"{alone} ends {away}")
-    return texts
 
 
 def warn(title: str, simulation: FreeSimulation) -> list[str]:

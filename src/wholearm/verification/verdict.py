@@ -27,6 +27,7 @@ from ..simulation.events import EventKind, Simulation
 DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
+STRAY = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 
@@ -34,27 +35,26 @@ PLACES = 33
 @declare(
     key("departure", kind=POSITIVE),
     key("rest_speed", kind=POSITIVE),
-    key("stray", kind=POSITIVE),
     UNIQUENESS,
 )
 @dataclass(frozen=True)
 class Allowance:
     """What a replay may differ by from what is asked and still hold.
 
-    InputError if one of the first three is not positive, or the last is 1 or more.
+    InputError if one of the first two is not positive, or the last is 1 or more.
     """
 
     departure: float = DEPARTURE  # departure, rest_speed: as of `verify`
     rest_speed: float = REST_SPEED
-    stray: float = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
     uniqueness_margin: float = UNIQUENESS_MARGIN  # least one of contact forces
 
     def __post_init__(self) -> None:
         read_keys(self)
 
-    def measure_stray(self, problem: Problem) -> float:
-        """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
-        return 5e-7 * problem.scene.scales.force + self.stray * problem.epsilon
+
+def measure_stray(problem: Problem) -> float:
+    """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
+    return 5e-7 * problem.scene.scales.force + STRAY * problem.epsilon
 
 
 class EndDistance:
@@ -156,14 +156,14 @@ def measure_departure(deviation: Deviation, length: float) -> float:
 
 
 def describe_thin_margins(
-    simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
+    simulation: Simulation, phases: Sequence[PhaseReport]
 ) -> Iterator[Failure]:
     """Sentences on the normal forces below epsilon, but for contacts where they were lost."""
     problem = simulation.problem
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
     for phase in phases:
         for c in phase.contacts:
-            thin = c.margin < -allowance.measure_stray(problem)
+            thin = c.margin < -measure_stray(problem)
             if thin and (phase.number, c.contact) not in lost:
                 text = f"below epsilon = {problem.epsilon:g} N, at t = {c.time:.5g} s"
                 text = f"c_n of {c.contact} falls to {c.least:.5g} N, {text}, phase {phase.number}"

@@ -108,7 +108,7 @@ def verify(
     report = judge(simulation, plan, allowance, tolerance, uniqueness=True, reduced=reduced)
     if report.ok and not report.warnings:
         return report
-    return replace(report, help=find_help(simulation, report.phases, allowance))
+    return replace(report, help=find_help(simulation, report.phases))
 
 
 def observe(
@@ -163,7 +163,7 @@ def judge(
     reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += verdict.describe_failures(simulation, phases, gap if reached else None, allowance)
-    thin = list(verdict.describe_thin_margins(simulation, phases, allowance))
+    thin = list(verdict.describe_thin_margins(simulation, phases))
     warnings = _describe_torques(problem, torque)
     warnings += [
         f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
@@ -508,7 +508,7 @@ _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
 
 
 def find_help(
-    simulation: Simulation, phases: tuple[results.PhaseReport, ...], allowance: verdict.Allowance
+    simulation: Simulation, phases: tuple[results.PhaseReport, ...]
 ) -> results.TuningHelp:
     """Losses with changes of the torques that prevent them, and the approach to a missed end."""
     problem = simulation.problem
@@ -519,7 +519,7 @@ def find_help(
         if e.kind in _KINDS and (e.kind is not EventKind.SLIP or e.contact in rolling[e.phase])
     ]
     ended = {event[:2] for event in events}
-    allowed = allowance.measure_stray(problem)
+    allowed = verdict.measure_stray(problem)
     events += [
         (phase.number - 1, margin.contact, "thin", margin.time)
         for phase in phases
