@@ -34,8 +34,13 @@ from wholearm.contacts.closing import (
     place,
     place_flush,
 )
-from wholearm.contacts.elemental import build_features, candidate_contacts, parse_contact
-from wholearm.contacts.formation import Formation, build_slip, find_touching
+from wholearm.contacts.elemental import (
+    build_features,
+    build_pair,
+    candidate_contacts,
+    parse_contact,
+)
+from wholearm.contacts.formation import Formation, find_touching
 from wholearm.mapping.borders import label_cells
 from wholearm.verification.newton_euler import locate
 
@@ -100,7 +105,7 @@ def test_pointed_tip_has_no_arc() -> None:
 def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
     formation = make_formation(scene, name)
-    slip, z_symbol = build_slip(formation.contacts[0], scene), build_features(scene).z
+    slip, z_symbol = build_pair(formation.contacts[0], scene).slip, build_features(scene).z
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
     rng = np.random.default_rng(6)
     for z in configurations(6, 8):

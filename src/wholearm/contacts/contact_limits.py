@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
+from itertools import accumulate
 
 import casadi as ca
 import numpy as np
@@ -15,7 +17,6 @@ from .elemental import (
     Contact,
     GapLimit,
     build_features,
-    build_gap,
     build_once,
     candidate_contacts,
     rotate_quarter,
@@ -83,15 +84,14 @@ def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     limits = [limit for c in contacts for limit in build_once(build_limits, c, scene)]
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
-        clearances = _list_clearances(scene, finger, held)
-        limits += clearances if finger is None else _list_obstacles(scene, finger, held, clearances)
+        limits += _list_clearances(scene, finger, held)
     if scene.fingers_collide:
         limits.append(GapLimit(build_finger_gap(scene), FINGERS_TOUCH))
     return limits
 
 
 def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[GapLimit]:
-    """Limits at which contacts with one part of the hand are gained that it does not have."""
+    """Limits of the features that do not touch a part of the hand whose contacts are `held`."""
     on_side = {contact.index for contact in held if contact.surface == "finger"}
     count = scene.polygon.n_vertices
     # A link that touches a vertex can only turn onto the edge that leads from it to the tip;
@@ -100,7 +100,7 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
     ahead = {(index - (finger or 0)) % count for index in on_side}
     tips = [contact for contact in held if contact.surface == "tip"]
     behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
-    limits = []
+    contacts = []
     for contact in candidate_contacts(scene, finger):
         if contact in held:
             continue
@@ -109,8 +109,29 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
             continue
         if tips and not on_side and (on_tip or contact.index not in behind):
             continue
-        limits.append(build_once(build_clearance, contact, scene, bool(on_side)))
-    return limits
+        contacts.append(contact)
+    if finger is not None and not held:
+        kinds = [("v", "back"), ("e", "joint"), ("v", "joint")]
+        kinds = kinds if scene.fingers[finger].radius > 0 else kinds[:2]
+        contacts += [Contact(kind, i, part, finger) for kind, part in kinds for i in range(count)]
+    elif all((c.surface, c.feature) == ("tip", "e") for c in held):
+        for contact in held:
+            end = (contact.index + 1 - (finger or 0)) % count
+            contacts += [Contact("v", end, "back", finger), replace(contact, surface="joint")]
+    limits = [
+        build_once(build_clearance, c, scene, bool(held if c.surface == "joint" else on_side))
+        for c in contacts
+    ]
+    if finger is None or held:
+        return limits
+    # The object may be on either side of the link: gaps count where they overlap nowhere else.
+    apart, pairs = build_apart(scene, finger), build_features(scene).pairs
+    return [
+        limit._replace(value=ca.fmax(limit.value, apart - pairs[c].gap / 2))
+        if c.surface in ("finger", "back")
+        else limit
+        for c, limit in zip(contacts, limits, strict=True)
+    ]
 
 
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
@@ -121,9 +142,8 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     finger = contact.finger
     if finger is None:
         return []
-    link = build_features(scene).links[finger]
-    lengths = build_features(scene).edge_lengths
-    i, part, count = contact.index, contact.part, len(lengths)
+    pairs, count = build_features(scene).pairs, scene.polygon.n_vertices
+    ranges, i, part = pairs[contact].ranges, contact.index, contact.part
     before, after = (i - 1) % count, (i + 1) % count
     pointed = scene.fingers[finger].radius == 0
 
@@ -139,31 +159,26 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
         return tuple(c for c in (side, *edges) if c != contact) if pointed else ()
 
     if contact.surface == "finger":
-        run = link.vertex_run[i]
         off = f"v{i} runs off {part} at its"
         return [
-            GapLimit(run, f"{off} base"),
-            GapLimit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i), meeting(i)),
+            GapLimit(ranges[0], f"{off} base"),
+            GapLimit(ranges[1], f"{off} tip", gains("v", i), meeting(i)),
         ]
     if contact.feature == "e":
-        run = link.edge_run[i]
         off = f"{part} runs off edge {i} at v"
         return [
-            GapLimit(run, f"{off}{i}", gains("v", i), meeting(i)),
-            GapLimit(lengths[i] - run, f"{off}{after}", gains("v", after), meeting(after)),
+            GapLimit(ranges[0], f"{off}{i}", gains("v", i), meeting(i)),
+            GapLimit(ranges[1], f"{off}{after}", gains("v", after), meeting(after)),
         ]
     # Both sides of the link begin where the arc ends.
-    beyond, side = link.arc_run[i], link.vertex_gap[i] + scene.fingers[finger].radius
+    beyond, turned_before, turned = ranges
+    side = pairs[replace(contact, surface="finger")].gap + scene.fingers[finger].radius
     off = f"v{i} leaves {part} for the"
     return [
         GapLimit(ca.fmax(beyond, -side), f"{off} side of the link", gains("v", i, "finger")),
         GapLimit(ca.fmax(beyond, side), f"{off} far side of the link"),
-        GapLimit(
-            link.edge_run[before] - lengths[before],
-            f"edge {before} turns onto {part}",
-            gains("e", before),
-        ),
-        GapLimit(-link.edge_run[i], f"edge {i} turns onto {part}", gains("e", i)),
+        GapLimit(turned_before, f"edge {before} turns onto {part}", gains("e", before)),
+        GapLimit(turned, f"edge {i} turns onto {part}", gains("e", i)),
     ]
 
 
@@ -187,94 +202,31 @@ def list_renamed(
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
 
-    With a link that touches a vertex with its side (`touching`) they do, by convexity.
+    With a link that is `touching` a vertex with its side they do, by convexity; as does the gap of
+    a joint with the edge that the tip touches, wherever other edges are.
     """
-    gap = line_gap = build_gap(contact, scene)
-    text = f"{contact.corner} touches {contact.part}"
+    pair = build_features(scene).pairs[contact]
+    gained = contact if contact.surface in ("palm", "finger", "tip") else None
     if contact.finger is None or (touching and contact.surface == "finger"):
-        return GapLimit(gap, text, contact)
-    features, i = build_features(scene), contact.index
-    link = features.links[contact.finger]
-    if contact.surface == "finger":
-        gap = _confine(gap, link.vertex_run[i], scene.fingers[contact.finger].length)
-    elif contact.feature == "e":
-        gap = _confine(gap, link.edge_run[i], float(features.edge_lengths[i]))
-        gap = gap if touching else ca.fmax(gap, link.other_gap[i] - line_gap)
-    else:
-        for limit in build_limits(contact, scene):
-            gap = ca.fmax(gap, -limit.value)
-    return GapLimit(gap, text, contact)
+        return GapLimit(pair.gap, pair.text, gained)
+    gap, ranges = pair.gap, pair.ranges
+    if (contact.feature, contact.surface) == ("v", "tip"):
+        ranges = tuple(limit.value for limit in build_limits(contact, scene))
+    for inside in ranges:
+        gap = ca.fmax(gap, -inside)
+    if contact.feature == "e" and not touching:
+        others = build_once(_list_other_gaps, replace(contact, index=0), scene)
+        gap = ca.fmax(gap, others[contact.index] - pair.gap)
+    return GapLimit(gap, pair.text, gained)
 
 
-def _build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> GapLimit:
-    """Limit at which a vertex touches a link's far side; `apart` as of `_confine`."""
-    link, part = build_features(scene).links[finger], scene.fingers[finger]
-    gap = -link.vertex_gap[vertex] - 2 * part.radius
-    text = f"v{vertex} touches the far side of finger {finger + 1}"
-    return GapLimit(_confine(gap, link.vertex_run[vertex], part.length, apart), text)
-
-
-def _build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
-    """Limit at which an edge touches a joint's circle; `held`: the tip touches that edge."""
-    features = build_features(scene)
-    gaps, runs = _place_joint(scene, finger)
-    gap = _confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
-    for other in range(0 if held else gaps.shape[1]):
-        if other != edge:
-            gap = ca.fmax(gap, gaps[other] - gaps[edge])
-    return GapLimit(gap, f"e{edge} touches the joint of finger {finger + 1}")
-
-
-def _build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
-    """Limit at which a vertex touches the circle about a joint."""
-    features = build_features(scene)
-    link, lengths = features.links[finger], features.edge_lengths
-    _, runs = _place_joint(scene, finger)
-    before = (vertex - 1) % len(lengths)
-    away = features.vertices[:, vertex] - link.base
-    gap = ca.sqrt(ca.sum1(away**2)) - scene.fingers[finger].radius
-    beyond = ca.fmax(runs[vertex], float(lengths[before]) - runs[before])
-    gap = ca.fmax(gap, ca.fmax(link.vertex_run[vertex], beyond))
-    return GapLimit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
-
-
-def _list_obstacles(
-    scene: Scene, finger: int, held: list[Contact], gained: list[GapLimit]
-) -> list[GapLimit]:
-    """Limits of a link with its contacts `held`: those `gained`, of its far side and its joint."""
-    vertices = range(scene.polygon.n_vertices)
-    if held:
-        if any((c.surface, c.feature) != ("tip", "e") for c in held):
-            return gained
-        for contact in held:
-            ahead = (contact.index + 1 - finger) % len(vertices)
-            gained.append(_build_far_side(scene, finger, ahead, None))
-            gained.append(_build_joint_edge(scene, finger, contact.index, held=True))
-        return gained
-    # The object may be on the far side, too.
-    apart, gaps = build_apart(scene, finger), build_features(scene).links[finger].vertex_gap
-    limits = [
-        limit._replace(value=ca.fmax(limit.value, apart - gaps[limit.gained.index] / 2))
-        if limit.gained is not None and limit.gained.surface == "finger"
-        else limit
-        for limit in gained
-    ]
-    limits += [_build_far_side(scene, finger, i, apart) for i in vertices]
-    limits += [_build_joint_edge(scene, finger, i, held=False) for i in vertices]
-    if scene.fingers[finger].radius > 0:
-        limits += [_build_joint_vertex(scene, finger, i) for i in vertices]
-    return limits
-
-
-def _confine(
-    gap: Expression, run: Expression, length: float, apart: Expression | None = None
-) -> Expression:
-    """Return a gap that counts only where 0 <= run <= length.
-
-    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else.
-    """
-    value = ca.fmax(gap, ca.fmax(-run, run - length))
-    return value if apart is None else ca.fmax(value, apart - gap / 2)
+def _list_other_gaps(contact: Contact, scene: Scene) -> list[Expression]:
+    """For each edge the largest gap of all others with an end of a link, by running maxima."""
+    values = ca.vertsplit(build_features(scene).stack_gaps("e", contact.surface, contact.finger))
+    before = list(accumulate(values[:-1], ca.fmax))
+    after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
+    inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
+    return [after[0], *inner, before[-1]]
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:
@@ -282,13 +234,16 @@ def build_apart(scene: Scene, finger: int) -> Expression:
 
     Candidates are the normals of link and edges, and the lines from ends of the link to vertices.
     """
-    features = build_features(scene)
-    link, part = features.links[finger], scene.fingers[finger]
-    at_joint, _ = _place_joint(scene, finger)
+    features, part = build_features(scene), scene.fingers[finger]
+    link = features.links[finger]
+    on_side, at_tip, at_joint = (
+        features.stack_gaps(kind, surface, finger)
+        for kind, surface in (("v", "finger"), ("e", "tip"), ("e", "joint"))
+    )
     parts = [
-        ca.mmin(link.vertex_gap),
-        -ca.mmax(link.vertex_gap) - 2 * part.radius,
-        ca.mmax(ca.fmin(at_joint, link.edge_gap)),
+        ca.mmin(on_side),
+        -ca.mmax(on_side) - 2 * part.radius,
+        ca.mmax(ca.fmin(at_joint, at_tip)),
     ]
     for end, other in ((link.base, link.tip), (link.tip, link.base)):
         rays = features.vertices - ca.repmat(end, 1, features.vertices.shape[1])
@@ -299,13 +254,3 @@ def build_apart(scene: Scene, finger: int) -> Expression:
             nearest = ca.fmin(nearest, table[:, column])
         parts.append(ca.mmax(nearest - ca.fmax(table[:, -1], 0)) - part.radius)
     return ca.mmax(ca.vertcat(*parts))
-
-
-def _place_joint(scene: Scene, finger: int) -> tuple[Expression, Expression]:
-    """Gaps of a joint's circle with each edge's line, and runs along it, shape (1, n_v) [m]."""
-    features = build_features(scene)
-    to_joint = ca.repmat(features.links[finger].base, 1, features.vertices.shape[1])
-    to_joint = to_joint - features.vertices
-    normals = features.edge_normals
-    along = ca.vertcat(normals[1, :], -normals[0, :])
-    return -ca.sum1(normals * to_joint) - scene.fingers[finger].radius, ca.sum1(along * to_joint)

@@ -23,13 +23,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import casadi as ca
-import numpy as np
 
-from ..common.arrays import Array, Expression
+from ..common.arrays import Expression
 from ..common.errors import InputError
 from ..common.sharing import Store
 from ..scene.model import Scene
@@ -44,7 +42,9 @@ class Contact:
 
     feature: str  # {"v", "e"}: a vertex or an edge of the object
     index: int  # which vertex or edge
-    surface: str  # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link
+    # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link; of what only
+    # stops a motion {"back", "joint"}: the far side of a link or the circle about its joint
+    surface: str
     finger: int | None = None  # 0 for finger 1, 1 for finger 2, None for the palm
 
     @property
@@ -62,52 +62,47 @@ class Contact:
         """The part of the hand, in words."""
         if self.finger is None:
             return "the palm"
-        return f"{'the tip of ' if self.surface == 'tip' else ''}finger {self.finger + 1}"
+        where = {"tip": "the tip of ", "back": "the far side of ", "joint": "the joint of "}
+        return f"{where.get(self.surface, '')}finger {self.finger + 1}"
 
     def __str__(self) -> str:
         return self.name
 
 
-class LinkFeatures(NamedTuple):
-    """One link against the whole object, as expressions of z."""
+class ContactPair(NamedTuple):
+    """Two features that may touch, as expressions of z."""
 
-    # base, tip, normal (2,): joint [m], centre of the tip [m], and the normal of the link's
-    # touching side
-    base: Expression
+    name: str
+    gap: Expression  # [m]: the C-function, positive when apart
+    slip: Expression  # [m]: its rate is the sliding velocity v_t while they touch
+    # [m]: all positive where the two face each other; the gap means nothing elsewhere
+    ranges: tuple[Expression, ...] = ()
+    text: str = ""  # what has happened when the gap closes, in words
+
+
+class Link(NamedTuple):
+    """A link as expressions of z."""
+
+    base: Expression  # base, tip (2,) [m]: the joint, and the centre of the tip
     tip: Expression
+    axis: Expression  # axis, normal (2,): directions of the tip and of the touching side
     normal: Expression
-    # vertex_gap, vertex_run (1, n_v) [m]: C-function of each vertex with the side, and how far
-    # along the link the vertex is
-    vertex_gap: Expression
-    vertex_run: Expression
-    other_gap: list[Expression]  # [m]: the largest `edge_gap` of all other edges, for each edge
-    # edge_gap, edge_run (1, n_v) [m]: C-function of the tip with each edge, and how far along the
-    # edge the tip is
-    edge_gap: Expression
-    edge_run: Expression
-    # arc_gap, arc_run (1, n_v) [m]: C-function of each vertex with the tip's arc, and how far
-    # beyond the tip's centre it is
-    arc_gap: Expression
-    arc_run: Expression
+    length: Expression  # length, radius [m]
+    radius: Expression
 
 
 class Features(NamedTuple):
-    """A scene as expressions of its own symbol z: what every contact picks its rows from."""
+    """Object and hand as expressions of z: what every contact is picked from."""
 
     z: Expression  # (5,)
     vertices: Expression  # (2, n_v) [m]: world positions of the vertices
-    edge_normals: Expression  # (2, n_v): normals of the edges into the object
-    edge_lengths: Array  # (n_v,) [m]
-    links: tuple[LinkFeatures, ...]  # finger 1, finger 2
+    links: tuple[Link, ...]  # finger 1, finger 2
+    pairs: dict[Contact, ContactPair]  # of all features of the object with all of the hand
 
-
-class Geometry(NamedTuple):
-    """A contact as expressions of z."""
-
-    gap: Expression  # [m]: the C-function
-    # point, normal (2,) [m], [-]: where the contact is, and its normal into the object
-    point: Expression
-    normal: Expression
+    def stack_gaps(self, feature: str, surface: str, finger: int | None) -> Expression:
+        """Gaps of all vertices or edges with a part of a finger, shape (n_v, 1) [m]."""
+        contacts = (Contact(feature, k, surface, finger) for k in range(self.vertices.shape[1]))
+        return ca.vertcat(*(self.pairs[contact].gap for contact in contacts))
 
 
 class GapLimit(NamedTuple):
@@ -169,59 +164,56 @@ def build_features(scene: Scene) -> Features:
 
 
 def _build_features(scene: Scene) -> Features:
-    z = _Z
-    body = scene.polygon.vertices
-    run = np.roll(body, -1, axis=0) - body
-    lengths = np.hypot(run[:, 0], run[:, 1])
-    c, s = ca.cos(z[2]), ca.sin(z[2])
-    rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
-    vertices = rotation @ ca.DM(body.T) + ca.repmat(z[:2], 1, len(body))
-    along = rotation @ ca.DM((run / lengths[:, None]).T)
-    normals = ca.vertcat(-along[1, :], along[0, :])
-    links = (_build_link(scene, finger, z, vertices, along, normals) for finger in range(2))
-    return Features(z, vertices, normals, lengths, tuple(links))
+    links = [(ca.DM(link.base), link.length, link.radius) for link in scene.fingers]
+    return place_bodies(ca.DM(scene.polygon.vertices.T), links)
 
 
 _FEATURES = Store(_build_features, lambda scene: scene.shape)
 
 
-def _build_link(
-    scene: Scene,
-    finger: int,
-    z: Expression,
-    vertices: Expression,
-    along: Expression,
-    edge_normals: Expression,
-) -> LinkFeatures:
-    link = scene.fingers[finger]
-    axis = ca.vertcat(ca.cos(z[3 + finger]), ca.sin(z[3 + finger]))
-    normal = rotate_quarter(axis) if finger == 0 else -rotate_quarter(axis)
-    base = ca.DM(link.base)
-    tip = base + link.length * axis
-    count = vertices.shape[1]
-    from_base = vertices - ca.repmat(base, 1, count)
-    to_tip = ca.repmat(tip, 1, count) - vertices
-    edge_gap = -ca.sum1(edge_normals * to_tip) - link.radius
-    return LinkFeatures(
-        base=base,
-        tip=tip,
-        normal=normal,
-        vertex_gap=normal.T @ from_base - link.radius,
-        vertex_run=axis.T @ from_base,
-        other_gap=_find_largest_others(ca.horzsplit(edge_gap)),
-        edge_gap=edge_gap,
-        edge_run=ca.sum1(along * to_tip),
-        arc_gap=ca.sqrt(ca.sum1(to_tip**2)) - link.radius,
-        arc_run=-axis.T @ to_tip,
-    )
-
-
-def _find_largest_others(values: list[Expression]) -> list[Expression]:
-    """The largest of all other values, for each one, from running maxima of both sides."""
-    before = list(accumulate(values[:-1], ca.fmax))
-    after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
-    inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
-    return [after[0], *inner, before[-1]]
+def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:
+    """Object and hand from corners, (2, n_v), and base, length and radius of each link [m]."""
+    z, count = _Z, corners.shape[1]
+    run = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
+    lengths = ca.hypot(run[0, :], run[1, :])
+    c, s = ca.cos(z[2]), ca.sin(z[2])
+    rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
+    vertices = rotation @ corners + ca.repmat(z[:2], 1, count)
+    along = rotation @ (run / ca.repmat(lengths, 2, 1))
+    normals = ca.vertcat(-along[1, :], along[0, :])
+    parts = list[Link]()
+    # Gap, slip and ranges of each kind of pair, as rows over all vertices or edges.
+    kinds: list[tuple[int | None, dict[str, Sequence[Expression]]]]
+    kinds = [(None, {"v palm": (vertices[1, :], vertices[0, :])})]
+    for finger, (base, length, radius) in enumerate(links):
+        side, theta = 1.0 - 2 * finger, z[3 + finger]
+        axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
+        link = Link(base, base + length * axis, axis, side * rotate_quarter(axis), length, radius)
+        parts.append(link)
+        away = vertices - ca.repmat(base, 1, count)
+        run, level = axis.T @ away, link.normal.T @ away
+        inside = run, length - run
+        front = level - radius, side * run, *inside
+        kinds.append((finger, {"v finger": front, "v back": (-level - radius, -front[1], *inside)}))
+        for surface, centre, out in (("tip", link.tip, axis), ("joint", base, -axis)):
+            far = ca.repmat(centre, 1, count) - vertices
+            run, ahead, across = ca.sum1(along * far), -out.T @ far, -rotate_quarter(out).T @ far
+            slip, turn = -run - radius * (z[2] - theta), -radius * ca.atan2(across, ahead)
+            edge_gap, arc_gap = -ca.sum1(normals * far) - radius, ca.sqrt(ca.sum1(far**2)) - radius
+            past = run - lengths
+            before = ca.horzcat(past[-1], past[:-1])
+            edges, arcs = (edge_gap, slip, run, -past), (arc_gap, turn, ahead, before, -run)
+            kinds.append((finger, {f"e {surface}": edges, f"v {surface}": arcs}))
+    pairs = {}
+    for owner, rows in kinds:
+        columns = [zip(*map(ca.horzsplit, row), strict=True) for row in rows.values()]
+        for k, entries in enumerate(zip(*columns, strict=True)):
+            for kind, (gap, slip, *ranges) in zip(rows, entries, strict=True):
+                feature, surface = kind.split()
+                contact = Contact(feature, k, surface, owner)
+                text = f"{contact.corner} touches {contact.part}"
+                pairs[contact] = ContactPair(contact.name, gap, slip, tuple(ranges), text)
+    return Features(z, vertices, tuple(parts), pairs)
 
 
 _BUILT: Store[dict[Any, Any]] = Store(lambda scene: {}, lambda scene: scene.shape)
@@ -235,56 +227,9 @@ def build_once(build: Callable[..., Any], contact: Contact, scene: Scene, *optio
     return built[key]
 
 
-def build_gap(contact: Contact, scene: Scene) -> Expression:
-    """Return the C-function of `contact` [m], an expression of the features' symbol z."""
-    features = build_features(scene)
-    if contact.finger is None:
-        return features.vertices[1, contact.index]
-    link = features.links[contact.finger]
-    if contact.surface == "finger":
-        return link.vertex_gap[contact.index]
-    return (link.edge_gap if contact.feature == "e" else link.arc_gap)[contact.index]
-
-
-def build_geometry(contact: Contact, scene: Scene) -> Geometry:
+def build_pair(contact: Contact, scene: Scene) -> ContactPair:
     """Return `contact` as expressions of the features' symbol z."""
-    features = build_features(scene)
-    gap = build_gap(contact, scene)
-    point = features.vertices[:, contact.index]
-    if contact.finger is None:
-        normal = ca.DM([0.0, 1.0])
-    else:
-        link = features.links[contact.finger]
-        radius = scene.fingers[contact.finger].radius
-        if contact.surface == "finger":
-            normal = link.normal
-        elif contact.feature == "e":
-            normal = features.edge_normals[:, contact.index]
-            point = link.tip + radius * normal
-        else:
-            normal = (point - link.tip) / (gap + radius)
-    return Geometry(gap, point, normal)
-
-
-def build_rows(contacts: Sequence[Contact], scene: Scene) -> tuple[Expression, ...]:
-    """Return gaps, shape (n_c,) [m], and the rows A and A_t of contacts, shape (n_c, 5).
-
-    A = [W_n^T, -J_n] and A_t = [W_t^T, -J_t], all contacts at once.
-    """
-    parts = [build_geometry(contact, scene) for contact in contacts]
-    gaps = ca.vertcat(ca.SX(0, 1), *(part.gap for part in parts))
-    points = ca.horzcat(ca.SX(2, 0), *(part.point for part in parts)).T
-    normals = ca.horzcat(ca.SX(2, 0), *(part.normal for part in parts)).T
-    arms = points - ca.repmat(build_features(scene).z[:2].T, len(parts), 1)
-    rows = []
-    for along in (normals, ca.horzcat(normals[:, 1], -normals[:, 0])):
-        turns = [arms[:, 0] * along[:, 1] - arms[:, 1] * along[:, 0]]
-        for finger, link in enumerate(scene.fingers):
-            on_finger = ca.sparsify(ca.DM([float(c.finger == finger) for c in contacts]))
-            levers = points - ca.repmat(ca.DM(link.base).T, len(parts), 1)
-            turns.append((levers[:, 1] * along[:, 0] - levers[:, 0] * along[:, 1]) * on_finger)
-        rows.append(ca.horzcat(along, *turns))
-    return gaps, *rows
+    return build_features(scene).pairs[contact]
 
 
 def rotate_quarter(vector: Expression) -> Expression:

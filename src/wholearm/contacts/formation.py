@@ -27,9 +27,8 @@ from .elemental import (
     Contact,
     GapLimit,
     build_features,
-    build_gap,
     build_once,
-    build_rows,
+    build_pair,
     candidate_contacts,
 )
 
@@ -170,7 +169,7 @@ class Formation(Keeper):
     def evaluate_gap(self, contact: Contact, z: Array) -> Array:
         """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
         function = ca.Function(
-            "gap", [build_features(self.scene).z], [build_gap(contact, self.scene)]
+            "gap", [build_features(self.scene).z], [build_pair(contact, self.scene).gap]
         )
         return np.asarray(function(z.T).full()[0])
 
@@ -203,9 +202,11 @@ _V = ca.SX.sym("v", 5)  # of all scenes, as z is
 
 
 def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
-    """Gap, rows A and A_t, and A' v of a contact."""
-    gap, A, A_t = build_rows((contact,), scene)
-    return gap, A, A_t, ca.jtimes(A @ _V, build_features(scene).z, _V)
+    """Gap, rows A and A_t, A' v, slip coordinate [m] and A_t' v of a contact."""
+    pair, z = build_pair(contact, scene), build_features(scene).z
+    A, A_t = (ca.jacobian(value, z) for value in (pair.gap, pair.slip))
+    bend, slip_bend = (ca.jtimes(rows @ _V, z, _V) for rows in (A, A_t))
+    return tuple(ca.cse([pair.gap, A, A_t, bend, pair.slip, slip_bend]))
 
 
 def _build_function(formation: Formation) -> Batch:
@@ -222,9 +223,8 @@ def _build_roll_function(formation: Formation) -> Batch:
     scene = formation.scene
     z = build_features(scene).z
     rolling = [formation.contacts[row] for row in formation.rolling_rows]
-    slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, scene) for c in rolling))
-    _, _, A_t = build_rows(rolling, scene)
-    bend = ca.jtimes(A_t @ _V, z, _V)
+    parts = [build_once(_build_part, contact, scene)[4:] for contact in rolling]
+    slip, bend = (ca.vertcat(ca.SX(0, 1), *column) for column in zip(*parts, strict=True))
     return Batch(ca.Function("roll", [z, _V], [ca.densify(slip), ca.densify(bend)]))
 
 
@@ -238,25 +238,3 @@ _ROLL_FUNCTIONS = Store(_build_roll_function, lambda f: (f.scene.shape, f.contac
 _LIMIT_FUNCTIONS = Store(
     _build_limit_function, lambda f: (f.scene.shape, f.scene.fingers_collide, f.contacts)
 )
-
-
-def build_slip(contact: Contact, scene: Scene) -> Expression:
-    """Slip coordinate of `contact` [m], whose rate is v_t, an expression of the features' z.
-
-    * vertex on the palm: x of the vertex;
-    * vertex on a link: place along it, towards the tip for finger 1, the joint for finger 2;
-    * tip on an edge: minus the place along the edge and the arc rolled;
-    * vertex on a tip: minus the arc from the link's axis.
-    """
-    features = build_features(scene)
-    if contact.finger is None:
-        return features.vertices[0, contact.index]
-    i, link, z = contact.index, features.links[contact.finger], features.z
-    radius = scene.fingers[contact.finger].radius
-    side = 1.0 if contact.finger == 0 else -1.0
-    if contact.surface == "finger":
-        return side * link.vertex_run[i]
-    if contact.feature == "e":
-        return -link.edge_run[i] - radius * (z[2] - z[3 + contact.finger])
-    across = side * (link.vertex_gap[i] + radius)
-    return -radius * ca.atan2(across, link.arc_run[i])

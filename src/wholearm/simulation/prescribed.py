@@ -37,7 +37,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
-from ..contacts.elemental import build_features, build_gap
+from ..contacts.elemental import build_features, build_pair
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
@@ -128,7 +128,7 @@ def _build_leg(
         # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
         distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
     else:
-        distance = build_gap(until.contact, scene)
+        distance = build_pair(until.contact, scene).gap
     mass, unit = ca.DM(scene.mass_diagonal), scene.scales.speed * scene.scales.mass**0.5
     speed = ca.dot(before, mass * v) / unit if mode.n_constraints >= 4 else ca.SX(1)
     gaps = [limit.value / scene.scales.length for limit in limits]

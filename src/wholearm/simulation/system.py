@@ -38,7 +38,7 @@ import numpy as np
 from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Keeper, Store, kept_property
 from ..contacts.contact_limits import FINGERS_TOUCH, build_apart, build_finger_gap
-from ..contacts.elemental import build_features, rotate_quarter
+from ..contacts.elemental import ContactPair, Link, build_features, place_bodies
 from ..scene.model import Scales, Scene
 
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
@@ -50,18 +50,6 @@ REST_WINDOW = 2e-3  # time of rest before a torque break: too short for contacts
 FIRST_STEP = 2e-2  # length of the first step tried from rest
 SHORTEST_STEP = 1e-13  # underflow of a step, over the scene's time and the elapsed time
 STILL = 1e-10  # acceleration that counts as rounding
-
-
-@dataclass(frozen=True, eq=False)
-class ContactPair:
-    """Two features that may touch."""
-
-    name: str
-    gap: Expression  # [m]: positive when apart
-    slip: Expression  # [m]: its rate is the sliding velocity v_t while they touch
-    # [m]: all positive where the two face each other; the gap means nothing elsewhere
-    ranges: tuple[Expression, ...] = ()
-    text: str = ""  # what has happened when the gap closes, in words
 
 
 class ContactRows(NamedTuple):
@@ -201,29 +189,6 @@ class System:
         return force
 
 
-class _Link(NamedTuple):
-    """A link as expressions; `normal` is that of its touching side."""
-
-    base: Expression
-    tip: Expression
-    axis: Expression
-    normal: Expression
-    length: Expression
-    radius: Expression
-    theta: Expression
-
-
-class _Bodies(NamedTuple):
-    """The object and both links as expressions of z and of the numbers of a scene."""
-
-    z: Expression
-    geometry: Expression
-    vertices: Expression  # vertices, along (2, n_v): along are directions of the edges
-    along: Expression
-    lengths: Expression
-    links: tuple[_Link, _Link]
-
-
 @lru_cache(maxsize=64)
 def build_system(scene: Scene) -> System:
     """The hand and the object as a system with five coordinates."""
@@ -266,88 +231,31 @@ _GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))
 @lru_cache(maxsize=16)
 def _build(count: int, rounded: tuple[bool, ...], collide: bool) -> Structure:
     """The structure of all scenes with as many vertices, and links with or without a radius."""
-    bodies = _place(count, rounded)
-    height, run = bodies.vertices[1, :], bodies.vertices[0, :]
-    pairs = [
-        ContactPair(f"v{i}-palm", height[i], run[i], text=f"v{i} touches the palm")
-        for i in range(count)
+    geometry = ca.SX.sym("geometry", 2 * count + 8)
+    parts = (ca.vertsplit(part) for part in ca.vertsplit(geometry[2 * count :], 4))
+    links = [
+        (ca.vertcat(x, y), length, radius if thick else ca.SX(0))
+        for (x, y, length, radius), thick in zip(parts, rounded, strict=True)
     ]
-    for finger in range(2):
-        pairs += _list_sides(bodies, finger) + _list_ends(bodies, finger, rounded[finger])
+    bodies, pairs = place_bodies(ca.reshape(geometry[: 2 * count], 2, count), links), []
+    for contact, pair in bodies.pairs.items():
+        if contact.surface in ("finger", "back"):
+            # By convexity the whole object is on the side that it touches between its ends.
+            link, way = bodies.links[contact.finger or 0], 1 if contact.surface == "finger" else -1
+            middle = way * link.normal.T @ (bodies.z[:2] - link.base)
+            pair = pair._replace(ranges=(*pair.ranges, middle))
+        elif contact.feature == "v" and contact.finger is not None and not rounded[contact.finger]:
+            continue
+        pairs.append(pair)
     if collide:
-        pairs += _list_link_pairs(bodies, any(rounded))
+        pairs += _list_link_pairs(bodies.links, any(rounded))
     turns = (False, False, True, True, True)
-    return Structure(bodies.z, bodies.geometry, tuple(pairs), (3, 4), turns)
+    return Structure(bodies.z, geometry, tuple(pairs), (3, 4), turns)
 
 
-def _place(count: int, rounded: tuple[bool, ...]) -> _Bodies:
-    z, geometry = ca.SX.sym("z", 5), ca.SX.sym("geometry", 2 * count + 8)
-    corners = ca.reshape(geometry[: 2 * count], 2, count)
-    run = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
-    lengths = ca.sqrt(ca.sum1(run**2))
-    c, s = ca.cos(z[2]), ca.sin(z[2])
-    turn = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
-    vertices = turn @ corners + ca.repmat(z[:2], 1, count)
-    along = turn @ (run / ca.repmat(lengths, 2, 1))
-    links = []
-    for finger in range(2):
-        x, y, length, radius = ca.vertsplit(geometry[2 * count + 4 * finger :][:4])
-        base, theta = ca.vertcat(x, y), z[3 + finger]
-        axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
-        normal = rotate_quarter(axis) if finger == 0 else -rotate_quarter(axis)
-        thick = radius if rounded[finger] else ca.SX(0)
-        links.append(_Link(base, base + length * axis, axis, normal, length, thick, theta))
-    return _Bodies(z, geometry, vertices, along, lengths, (links[0], links[1]))
-
-
-def _list_sides(bodies: _Bodies, finger: int) -> list[ContactPair]:
-    """Vertices against both sides of a link."""
-    link, k, side = bodies.links[finger], finger + 1, 1.0 if finger == 0 else -1.0
-    # By convexity the whole object is on the side that it touches between its ends.
-    middle = link.normal.T @ (bodies.z[:2] - link.base)
-    away = bodies.vertices - ca.repmat(link.base, 1, bodies.vertices.shape[1])
-    runs, levels = link.axis.T @ away, link.normal.T @ away
-    sides = (("finger", 1.0, ""), ("back", -1.0, "the far side of "))
-    columns: list[Expression] = [runs, link.length - runs]
-    for _, way, _ in sides:
-        columns += [way * levels - link.radius, way * side * runs]
-    pairs = []
-    for i, (run, rest, *contacts) in enumerate(zip(*map(ca.horzsplit, columns), strict=True)):
-        for (name, way, text), gap, slip in zip(sides, contacts[::2], contacts[1::2], strict=True):
-            title = f"v{i} touches {text}finger {k}"
-            ranges = (run, rest, way * middle)
-            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, slip, ranges, title))
-    return pairs
-
-
-def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[ContactPair]:
-    """Vertices and edges against the tip of a link and the circle about its joint."""
-    link, k, count = bodies.links[finger], finger + 1, bodies.vertices.shape[1]
-    normals = ca.vertcat(-bodies.along[1, :], bodies.along[0, :])
-    pairs = []
-    for name, centre, out in (("tip", link.tip, link.axis), ("joint", link.base, -link.axis)):
-        far = ca.repmat(centre, 1, count) - bodies.vertices
-        runs = ca.sum1(bodies.along * far)
-        rests, gaps = bodies.lengths - runs, -ca.sum1(normals * far) - link.radius
-        slips = -runs - link.radius * (bodies.z[2] - link.theta)
-        aheads, across = -out.T @ far, -rotate_quarter(out).T @ far
-        turns = -link.radius * ca.atan2(across, aheads)
-        aways = ca.sqrt(ca.sum1(far**2)) - link.radius
-        columns = map(ca.horzsplit, (runs, rests, gaps, slips, aheads, turns, aways))
-        past = [-rest for rest in ca.horzsplit(rests)]
-        for i, (run, rest, gap, slip, ahead, turn, away) in enumerate(zip(*columns, strict=True)):
-            text = f"e{i} touches the {name} of finger {k}"
-            pairs.append(ContactPair(f"e{i}-{name}{k}", gap, slip, (run, rest), text))
-            if rounded:
-                text = f"v{i} touches the {name} of finger {k}"
-                ranges = (ahead, past[i - 1], -run)
-                pairs.append(ContactPair(f"v{i}-{name}{k}", away, turn, ranges, text))
-    return pairs
-
-
-def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
+def _list_link_pairs(links: Sequence[Link], rounded: bool) -> list[ContactPair]:
     """Tips and joints of either link against the other link."""
-    links, pairs, none = bodies.links, list[ContactPair](), ca.SX(0)
+    pairs, none = list[ContactPair](), ca.SX(0)
     thick = links[0].radius + links[1].radius
     for finger, other in ((0, 1), (1, 0)):
         mine, theirs = links[finger], links[other]
