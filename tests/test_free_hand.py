@@ -22,13 +22,14 @@ from wholearm.analysis.robustness import change_problem
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
+from wholearm.contacts.contact_limits import measure_gaps
 from wholearm.contacts.elemental import parse_contact
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.system import ContactPair, Structure, System, build_system, measure_gaps
+from wholearm.simulation.system import ContactPair, Structure, System, build_system
 from wholearm.verification.free import verify_free
 
 
@@ -473,7 +474,7 @@ def test_a_corner_that_rises_past_the_end_of_a_table(enters: float, lands: bool)
     # of the table at `enters`: onto the table, or beneath it.
     system = make_body([(0.0, 0.0)])
     (pair,), z = system.structure.pairs, system.structure.z
-    pairs = (dataclasses.replace(pair, ranges=(z[0],)),)
+    pairs = (pair._replace(ranges=(z[0],)),)
     structure = dataclasses.replace(system.structure, pairs=pairs)
     system = dataclasses.replace(system, structure=structure)
     unit = system.scales.time

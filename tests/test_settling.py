@@ -33,7 +33,7 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import DRIVE, close_contacts, find_rest, maximise_margin
+from wholearm.simulation.modes import DRIVE, find_rest, maximise_margin, require_closed
 from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
@@ -125,7 +125,7 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         first = find_rest(phase.formation, z).sliding[0]
         assert first.heading is not None
         back = settling.gap / (normal @ first.heading) * first.heading
-        z = close_contacts(phase.formation, z + back)
+        z = require_closed(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
         tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).sliding
@@ -441,7 +441,7 @@ def turn(changes: dict[str, Any]) -> tuple[Problem, Formation, Array]:
     table = {**problem_of(HEPTAGON).table, "start": {"flush": 2, "x": -0.0597}, "phases": [*TURN]}
     problem = build_problem(table).with_(changes)
     formation = problem.phases[-1].formation
-    return problem, formation, close_contacts(formation, TURNED)
+    return problem, formation, require_closed(formation, TURNED)
 
 
 def test_continuous_torques_begin_on_the_verge_of_a_mode() -> None:

@@ -20,9 +20,9 @@ from wholearm import Formation, Objective, Scene, load
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.sharing import Batch
 from wholearm.geometry.curve import Curve, tangent_basis
-from wholearm.geometry.path_guess import close_contacts, list_ends
+from wholearm.geometry.path_guess import list_ends
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
+from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights, split_forces
 from wholearm.planning.nlp import Columns, Kernel, NlpRows, build_kernel, build_solver
 from wholearm.planning.time_domain.stage import (
     LimitMisses,

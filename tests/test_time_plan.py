@@ -57,9 +57,8 @@ from wholearm import (
 )
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import close_contacts
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, metric_weights
+from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages, list_stages

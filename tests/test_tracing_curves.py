@@ -31,9 +31,9 @@ from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import POINTS, PathGuess, close_contacts, guess_phase
+from wholearm.geometry.path_guess import POINTS, PathGuess, guess_phase
 from wholearm.geometry.tracing import trace_curve, trace_phases, until_distance
-from wholearm.mechanics.dynamics import metric_weights
+from wholearm.mechanics.dynamics import close_contacts, metric_weights
 from wholearm.planning.time_domain.time_plan import plan_phases
 
 NEVER = Until(coordinate="x", value=9.0)

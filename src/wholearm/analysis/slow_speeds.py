@@ -20,13 +20,14 @@ from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import Curve, border, describe_pose, solve_tangent
-from ..geometry.path_guess import RELEASE_AT, close_all, count_freedoms, find_end, guess_phase
+from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
     LAMBDA,
     ONE,
     Directions,
     PathForces,
+    close_all,
     force_rows,
     inverse,
     metric_weights,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array, find_runs
 from ..common.errors import InputError
 from ..scene.model import Finger, Scene
-from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap
+from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap, measure_gaps
 from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 
@@ -163,7 +163,9 @@ def _close_finger(
         feature[mine], angle[mine] = np.where(reached, numbers, -1), least
         obstacle[mine] = np.where(reached, 0, TOO_SHORT)
         if mine is not clear:
-            covered = (_distance(across, up) <= link.radius) | _hangs_into(link, across, up)
+            hanging = np.full((len(least), 5), -np.pi / 2)
+            hanging[:, :3] = np.column_stack([x, y, phi])[mine]
+            covered = measure_gaps(scene, hanging)[:, 1 + finger] < 1e-12 * link.length
             obstacle[mine] = np.where(covered, JOINT_COVERED, obstacle[mine])
     return angle, feature, obstacle
 
@@ -280,34 +282,6 @@ def _find_angle(
     else:
         inner = np.arccos((away**2 + link.length**2 - link.radius**2) / (2 * away * link.length))
     return np.asarray(np.arctan2(y, x) - sign * inner)
-
-
-def _hangs_into(link: Finger, x: Array, y: Array) -> Flags:
-    """Whether a link that points down, from where it closes, overlaps the object, shape (n,).
-
-    Vertices `x`, `y`, (m + 1, n), are relative to the joint; the last is the first one again.
-    """
-    tip = _distance(x, y + link.length) < link.radius
-    after_x, after_y = x[1:], y[1:]
-    x, y = x[:-1], y[:-1]
-    beside = (np.abs(x) < link.radius) & (y < 0) & (y > -link.length)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        height = y - x * (after_y - y) / (after_x - x)
-    crossed = (x * after_x < 0) & (height < 0) & (height > -link.length)
-    return np.asarray(beside.any(axis=0) | crossed.any(axis=0) | tip)
-
-
-def _distance(x: Array, y: Array) -> Array:
-    """Distance of convex anticlockwise polygons from the origin, zero inside, shape (n,) [m].
-
-    Vertices `x`, `y`, (m + 1, n); the last is the first one again.
-    """
-    run_x, run_y = x[1:] - x[:-1], y[1:] - y[:-1]
-    x, y = x[:-1], y[:-1]
-    cross = x * run_y - y * run_x
-    part = np.clip(-(x * run_x + y * run_y) / (run_x**2 + run_y**2), 0.0, 1.0)
-    distance = np.hypot(x + part * run_x, y + part * run_y).min(axis=0)
-    return np.asarray(np.where((cross >= 0).all(axis=0), 0.0, distance))
 
 
 def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = None) -> Kinematics:

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, exclusive
+from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .elemental import (
     Contact,
@@ -254,3 +254,22 @@ def build_apart(scene: Scene, finger: int) -> Expression:
             nearest = ca.fmin(nearest, table[:, column])
         parts.append(ca.mmax(nearest - ca.fmax(table[:, -1], 0)) - part.radius)
     return ca.mmax(ca.vertcat(*parts))
+
+
+def measure_gaps(scene: Scene, z: Array) -> Array:
+    """Gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
+
+    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
+    the largest separation in any direction, independent of the pairs.
+    """
+    return _GAPS(scene)(z)[0][..., 0]
+
+
+def _build_gaps(scene: Scene) -> Batch:
+    features = build_features(scene)
+    gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
+    gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
+    return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))
+
+
+_GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))

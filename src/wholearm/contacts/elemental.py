@@ -1,4 +1,4 @@
-"""Elemental contacts: one C-function each, as CasADi expressions of z.
+"""Elemental contacts: a C-function and a slip coordinate each, as CasADi expressions of z.
 
 ==============  ==============================  =======================================
 name            touching                        C-function
@@ -7,15 +7,22 @@ name            touching                        C-function
 ``v3-finger1``  vertex 3 on the side of link 1  n . (p - base) - radius
 ``e2-tip1``     fingertip 1 on edge 2           m . (tip - p_2) - radius
 ``v3-tip1``     vertex 3 on the arc of tip 1    abs(p - tip) - radius
+``v3-back1``    vertex 3, far side of link 1    -n . (p - base) - radius
+``v3-joint1``   vertex 3, circle about joint 1  abs(p - base) - radius
+``e2-joint1``   edge 2, circle about joint 1    m . (base - p_2) - radius
 ==============  ==============================  =======================================
 
 p is a vertex in the world, n the normal of the contact (into the object), m = -n the outward normal
 of an edge; edge j runs from vertex j to vertex j + 1. Finger 1 touches with its left side, finger 2
-with its right one. With the contact point p_c the rows of Eq. (4) are
+with its right one; far sides and joints only stop a motion. Slip coordinates, whose rates are the
+sliding velocities v_t of closed contacts:
 
-    W_n^T = [n, (p_c - c) x n] = dC/dq,  J_n = n . d p_finger / d theta = -dC/dtheta,
+* vertex on the palm: x of the vertex;
+* vertex on a link: place along it, towards the tip for finger 1, the joint for finger 2;
+* tip on an edge: minus the place along the edge and the arc rolled;
+* vertex on a tip: minus the arc from the link's axis.
 
-and the same with t = (n_y, -n_x) for W_t and J_t.
+The rows of Eq. (4), A = [W_n^T, -J_n] and A_t = [W_t^T, -J_t], are the gradients of both.
 """
 
 from __future__ import annotations
@@ -179,12 +186,15 @@ def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -
     c, s = ca.cos(z[2]), ca.sin(z[2])
     rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
     vertices = rotation @ corners + ca.repmat(z[:2], 1, count)
-    along = rotation @ (run / ca.repmat(lengths, 2, 1))
+    x, y = corners[0, :], corners[1, :]
+    along = run / ca.repmat(lengths, 2, 1)
+    # Products with the vertices do not depend on the pose.
+    starts, depths = along[0, :] * x + along[1, :] * y, along[0, :] * y - along[1, :] * x
+    along = rotation @ along
     normals = ca.vertcat(-along[1, :], along[0, :])
-    parts = list[Link]()
     # Gap, slip and ranges of each kind of pair, as rows over all vertices or edges.
-    kinds: list[tuple[int | None, dict[str, Sequence[Expression]]]]
-    kinds = [(None, {"v palm": (vertices[1, :], vertices[0, :])})]
+    parts, kinds = list[Link](), list[tuple[int | None, dict[str, tuple[Expression, ...]]]]()
+    kinds.append((None, {"v palm": (vertices[1, :], vertices[0, :])}))
     for finger, (base, length, radius) in enumerate(links):
         side, theta = 1.0 - 2 * finger, z[3 + finger]
         axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
@@ -193,16 +203,19 @@ def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -
         away = vertices - ca.repmat(base, 1, count)
         run, level = axis.T @ away, link.normal.T @ away
         inside = run, length - run
-        front = level - radius, side * run, *inside
-        kinds.append((finger, {"v finger": front, "v back": (-level - radius, -front[1], *inside)}))
+        sides = {
+            "v finger": (level - radius, side * run, *inside),
+            "v back": (-level - radius, -side * run, *inside),
+        }
+        kinds.append((finger, sides))
         for surface, centre, out in (("tip", link.tip, axis), ("joint", base, -axis)):
-            far = ca.repmat(centre, 1, count) - vertices
-            run, ahead, across = ca.sum1(along * far), -out.T @ far, -rotate_quarter(out).T @ far
-            slip, turn = -run - radius * (z[2] - theta), -radius * ca.atan2(across, ahead)
-            edge_gap, arc_gap = -ca.sum1(normals * far) - radius, ca.sqrt(ca.sum1(far**2)) - radius
-            past = run - lengths
-            before = ca.horzcat(past[-1], past[:-1])
-            edges, arcs = (edge_gap, slip, run, -past), (arc_gap, turn, ahead, before, -run)
+            place, away = centre - z[:2], vertices - ca.repmat(centre, 1, count)
+            run, depth = place.T @ along - starts, place.T @ normals - depths
+            rest = lengths - run
+            edges = -depth - radius, -run - radius * (z[2] - theta), run, rest
+            ahead, turn = out.T @ away, ca.atan2(rotate_quarter(out).T @ away, out.T @ away)
+            before = -ca.horzcat(rest[-1], rest[:-1])
+            arcs = ca.sqrt(ca.sum1(away**2)) - radius, -radius * turn, ahead, before, -run
             kinds.append((finger, {f"e {surface}": edges, f"v {surface}": arcs}))
     pairs = {}
     for owner, rows in kinds:

@@ -5,7 +5,7 @@ v_t = A_t z' with A_t = [W_t^T, -J_t]. Rolling contacts have v_t = 0 as well:
 
     P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
 
-n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`build_slip`), which
+n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`elemental`), which
 keeps its value from where the rolling begins.
 """
 

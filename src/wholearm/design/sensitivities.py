@@ -40,7 +40,7 @@ from ..planning.time_domain.guesses import list_stages
 from ..problem.definition import End, Problem
 from ..problem.read import require_phases
 from ..search import solve as solve_any
-from ..simulation.modes import close_contacts
+from ..simulation.modes import require_closed
 from .parameters import Parameter, find_parameter, list_parameters
 from .sweep import name_limit
 
@@ -250,7 +250,7 @@ def find_lagrangian(planning: Planning) -> Evaluate:
     def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
         terms: Terms = []
         for index, evaluate_block in reversed(made):
-            z = close_contacts(problem.phases[index].formation, z)
+            z = require_closed(problem.phases[index].formation, z)
             more, z = evaluate_block(problem, z)
             terms += more
         return terms, z

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array, find_root
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.dynamics import Directions, metric_weights
+from ..mechanics.dynamics import Directions, find_freedoms, metric_weights
 
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
 
@@ -209,9 +209,7 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
     """Orthonormal covectors N of the null space of P at `z`, shape (5, f), in radii of gyration."""
     metric = metric_weights(formation.scene)
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    _, values, right = np.linalg.svd(P / np.sqrt(metric))
-    rank = int((values > 1e-9 * values[0]).sum())
-    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+    return np.asarray(metric[:, None] * find_freedoms(P, metric, 1e-9) / np.sqrt(metric[2]))
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from ..common.errors import InputError
 from ..contacts.closing import close_fingers, find_reach, lower
 from ..contacts.contact_limits import build_limits
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions, metric_weights
+from ..mechanics.dynamics import Directions, Fixed, close_all, close_contacts, metric_weights
 from ..problem.definition import Phase
 from .curve import Curve, tangent_basis
 from .tracing import require_touching, runs_on_curve, trace_phase
@@ -25,63 +25,6 @@ GRID = (120, 60)  # places across x and phi at which a formation is looked at
 STILL = 1e-4  # distance from the start, in radii of gyration, that counts as none
 POINTS = 25  # configurations along a guess
 RELEASE_AT = 0.8  # share of a curve at which a release is guessed
-Fixed = tuple[tuple[int, float | Array], ...]
-"""Rows of z, and values that they have to take, one or (n,)."""
-
-
-def close_contacts(
-    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
-) -> Array | None:
-    """As `close_all` for one configuration, shape (5,); None if there is none."""
-    closed = close_all(formation, z[None], slip, fixed, active)[0]
-    return closed if np.isfinite(closed).all() else None
-
-
-def close_all(
-    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
-) -> Array:
-    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5), or NaN.
-
-    Parameters
-    ----------
-    z : (n, 5)       initial values
-    slip : (R,) [m]  slip coordinates of rolling contacts
-    fixed            rows of z and their values
-    active           limits of the formation that are zero
-    """
-    metric, rho = metric_weights(formation.scene), formation.scene.scales.length
-    sizes = np.full(formation.n_constraints, rho)
-    steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
-    sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
-    sizes = np.append(sizes, np.full(len(active), rho))
-    solutions, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
-    for _ in range(50):
-        kinematics = formation.evaluate(z, np.zeros(z.shape))
-        residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
-        rows = kinematics.P
-        for row, value in fixed:
-            values = np.broadcast_to(value, len(solutions))[left]
-            residual = np.column_stack([residual, z[:, row] - values])
-            one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
-            rows = np.concatenate([rows, one], axis=1)
-        if active:
-            residual = np.hstack([residual, formation.evaluate_limits(z)[:, active]])
-            near = (z[:, None] + np.vstack([steps, -steps])).reshape(-1, 5)
-            around = formation.evaluate_limits(near)[:, active].reshape(len(z), 2, 5, -1)
-            slopes = (around[:, 0] - around[:, 1]) / (2 * steps.diagonal()[:, None])
-            rows = np.concatenate([rows, slopes.swapaxes(1, 2)], axis=1)
-        rows, residual = rows / sizes[:, None], residual / sizes
-        lift = (rows / metric).swapaxes(1, 2)
-        change = (lift @ np.linalg.pinv(rows @ lift, rcond=1e-12) @ residual[..., None])[..., 0]
-        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
-        turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
-        z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
-        closed = np.abs(residual).max(axis=1) < 3e-11
-        solutions[left[closed]] = z[closed]
-        z, left = z[~closed], left[~closed]
-        if not len(left):
-            break
-    return solutions
 
 
 def is_inside(formation: Formation, z: Array) -> bool:

@@ -19,7 +19,7 @@ from ..common.arrays import Array, find_root
 from ..common.errors import InputError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import find_freedoms, metric_weights
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import read_problem
 from ..scene.model import TOUCHING
@@ -171,11 +171,9 @@ def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[
 
     That is where the ratio of singular values of P is below `least`.
     """
-    root = np.sqrt(metric_weights(formation.scene))
-    _, values, right = np.linalg.svd(formation.evaluate(z[None], z[None]).P[0] / root)
-    if values[-1] < least * values[0]:
-        return ()
-    return right[-1] / root, -right[-1] / root
+    P, metric = formation.evaluate(z[None], z[None]).P[0], metric_weights(formation.scene)
+    freedoms = find_freedoms(P, metric, least).T
+    return () if least and len(freedoms) > 1 else (freedoms[-1], -freedoms[-1])
 
 
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:

@@ -32,6 +32,9 @@ from ..common.arrays import Array, Expression
 from ..contacts.formation import Formation, Kinematics
 from ..scene.model import Scene
 
+Fixed = tuple[tuple[int, float | Array], ...]
+"""Rows of z, and values that they have to take, one or (n,)."""
+
 
 class Directions(NamedTuple):
     """Signs that friction depends on."""
@@ -194,6 +197,78 @@ def move_least(P: Array, right: Array, metric: Array) -> Array:
     return np.asarray(np.einsum("nij,ni->nj", over, amounts))
 
 
+def find_freedoms(P: Array, metric: Array, least: float) -> Array:
+    """Directions with P dz = 0 for P (n_p, 5), orthonormal in a diagonal metric, shape (5, f).
+
+    Singular values up to `least` times the largest one count as zero.
+    """
+    root = np.sqrt(metric)
+    _, values, right = np.linalg.svd(P / root)
+    return np.asarray(right[int((values > least * values[0]).sum()) :].T / root[:, None])
+
+
 def measure_speed(scene: Scene, v: Array) -> float:
     """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
     return float(np.sqrt(metric_weights(scene) @ v**2))
+
+
+def close_contacts(
+    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
+) -> Array | None:
+    """As `close_all` for one configuration, shape (5,); None if there is none."""
+    closed = close_all(formation, z[None], slip, fixed, active)[0]
+    return closed if np.isfinite(closed).all() else None
+
+
+def close_all(
+    formation: Formation,
+    z: Array,
+    slip: Array,
+    fixed: Fixed = (),
+    active: tuple[int, ...] = (),
+    metric: Array | None = None,
+) -> Array:
+    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5), or NaN.
+
+    Parameters
+    ----------
+    z : (n, 5)       initial values
+    slip : (R,) [m]  slip coordinates of rolling contacts
+    fixed            rows of z and their values
+    active           limits of the formation that are zero
+    metric : (5,)    diagonal of what "nearest" is measured in, by default that of curves
+    """
+    metric = metric_weights(formation.scene) if metric is None else metric
+    rho = formation.scene.scales.length
+    sizes = np.full(formation.n_constraints, rho)
+    steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
+    sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
+    sizes = np.append(sizes, np.full(len(active), rho))
+    solutions, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
+    for _ in range(50):
+        kinematics = formation.evaluate(z, np.zeros(z.shape))
+        residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
+        rows = kinematics.P
+        for row, value in fixed:
+            values = np.broadcast_to(value, len(solutions))[left]
+            residual = np.column_stack([residual, z[:, row] - values])
+            one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
+            rows = np.concatenate([rows, one], axis=1)
+        if active:
+            residual = np.hstack([residual, formation.evaluate_limits(z)[:, active]])
+            near = (z[:, None] + np.vstack([steps, -steps])).reshape(-1, 5)
+            around = formation.evaluate_limits(near)[:, active].reshape(len(z), 2, 5, -1)
+            slopes = (around[:, 0] - around[:, 1]) / (2 * steps.diagonal()[:, None])
+            rows = np.concatenate([rows, slopes.swapaxes(1, 2)], axis=1)
+        rows, residual = rows / sizes[:, None], residual / sizes
+        lift = (rows / metric).swapaxes(1, 2)
+        change = (lift @ np.linalg.pinv(rows @ lift, rcond=1e-12) @ residual[..., None])[..., 0]
+        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
+        turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
+        z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
+        closed = np.abs(residual).max(axis=1) < 3e-11
+        solutions[left[closed]] = z[closed]
+        z, left = z[~closed], left[~closed]
+        if not len(left):
+            break
+    return solutions

@@ -94,12 +94,14 @@ class LimitSet:
         """The limits of other kinds."""
         return LimitSet(tuple(limit for limit in self.limits if limit.kind not in kinds))
 
-    @cached_property
-    def split_speeds(self) -> tuple[LimitSet, LimitSet]:
-        """The limits that depend on forces or torques, and those of joint speeds alone."""
-        alone = [not limit.rows[:, :-2].any() for limit in self.limits]
-        pairs = list(zip(self.limits, alone, strict=True))
-        parts = (tuple(limit for limit, only in pairs if only is kind) for kind in (False, True))
+    def split(self, last: int) -> tuple[LimitSet, LimitSet]:
+        """The limits that depend on more than the `last` columns, and the others.
+
+        The last two are the speeds of the joints; torques are before them.
+        """
+        more = [limit.rows[:, :-last].any() for limit in self.limits]
+        pairs = list(zip(self.limits, more, strict=True))
+        parts = (tuple(limit for limit, kind in pairs if kind == side) for side in (True, False))
         first, second = map(LimitSet, parts)
         return first, second
 

@@ -44,7 +44,7 @@ class PathLimits(NamedTuple):
 
         They are relaxed by `give`, over their scales.
         """
-        bounds, speeds = limits.split_speeds
+        bounds, speeds = limits.split(2)
         rows = find_slack_rows(bounds, forces, rates)
         rows[..., ONE] += give
         return PathLimits(rows, (1 + give) * find_speed_cap(speeds, rates))

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array, sort_unique
 from ..contacts.formation import Formation
-from .dynamics import null_vector
+from .dynamics import find_freedoms, null_vector
 
 SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
 _TINY = 1e-9  # what counts as zero of numbers of the order of one
@@ -206,9 +206,7 @@ class Statics:
     @cached_property
     def freedoms(self) -> Array:
         """Basis of the accelerations that the contacts allow, shape (5, f)."""
-        root = np.sqrt(self.scene.mass_diagonal)
-        _, values, right = np.linalg.svd(self.kinematics.P[0] / root)
-        return np.asarray(right[int((values > _TINY * values[0]).sum()) :].T / root[:, None])
+        return find_freedoms(self.kinematics.P[0], self.scene.mass_diagonal, _TINY)
 
     @cached_property
     def near(self) -> NDArray[np.bool_]:

@@ -41,7 +41,7 @@ from ..results.dwell_record import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
-from ..simulation.modes import Hold, Standstill, close_contacts, find_hold, find_opening
+from ..simulation.modes import Hold, Standstill, find_hold, find_opening, require_closed
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
 from .options import Objective, PlanOptions
@@ -239,7 +239,7 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
     # From rest where the contact is still open.
     closes, left, torque = None, problem.gap, TorqueProfile(np.array([0.0, time]), tau)
     with suppress(SimulationError, ArithmeticError):
-        z = close_contacts(place.formation, place.z + problem.gap * opening)
+        z = require_closed(place.formation, place.z + problem.gap * opening)
         run = simulate_free(problem, torque, start=z)
         gaps = np.abs(place.touching.evaluate(run.z, run.z_dot).C).max(axis=1)
         still = np.flatnonzero(gaps > 0.01 * problem.gap)  # relative gap that counts as closed

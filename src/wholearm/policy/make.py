@@ -136,10 +136,7 @@ def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
 
     Speed limits are kept by the plan, and no motion of a policy is faster.
     """
-    limits, _ = make_limits(formation, 0.0).split_speeds
-    pairs = [(limit, limit.rows[:, :-4].any()) for limit in limits.limits]
-    contact, joint = ([limit for limit, own in pairs if own == kind] for kind in (True, False))
-    return LimitSet(tuple(contact)), LimitSet(tuple(joint))
+    return make_limits(formation, 0.0).split(2)[0].split(4)
 
 
 def find_torques(curve: Curve, s: Array, directions: Directions) -> Array:

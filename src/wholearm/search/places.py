@@ -15,8 +15,8 @@ from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose
-from ..geometry.path_guess import close_contacts
 from ..geometry.tracing import HELD, find_crossing, until_distance
+from ..mechanics.dynamics import close_contacts
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene
 

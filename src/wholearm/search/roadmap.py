@@ -22,9 +22,16 @@ from ..contacts.closing import place as place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.path_guess import close_contacts, is_inside
+from ..geometry.path_guess import is_inside
 from ..mapping.borders import NOWHERE, label_cells
-from ..mechanics.dynamics import ONE, Directions, force_rows, inverse, metric_weights
+from ..mechanics.dynamics import (
+    ONE,
+    Directions,
+    close_contacts,
+    force_rows,
+    inverse,
+    metric_weights,
+)
 from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep

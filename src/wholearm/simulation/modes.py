@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations, product
 from typing import Any, NamedTuple
@@ -47,6 +47,7 @@ from ..common.arrays import Array, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
+from ..mechanics.dynamics import close_all, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
@@ -449,11 +450,10 @@ def find_rest(formation: Formation, z: Array) -> Rest:
 def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
     """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
     slip = formation.evaluate_slip(z[None])[0]
-    ahead = close_contacts(formation, z + step * heading, slip=slip)
+    ahead = require_closed(formation, z + step * heading, slip=slip)
     kinematics = formation.evaluate(ahead[None], heading[None])
-    P, inverse_mass = kinematics.P[0], 1 / formation.scene.mass_diagonal
-    lift = inverse_mass[:, None] * P.T
-    tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
+    P, mass = kinematics.P, formation.scene.mass_diagonal
+    tangent = heading - move_least(P, P @ heading, mass)[0]
     return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
 
 
@@ -501,7 +501,7 @@ def _find_roots(polynomial: Array) -> list[float]:
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
 
 
-def close_contacts(
+def require_closed(
     formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
 ) -> Array:
     """Nearest configuration, in the metric M5, with every contact of the formation closed.
@@ -509,30 +509,17 @@ def close_contacts(
     Gaps up to `within` [m] are closed; rolling contacts take coordinates `slip`, (R,) [m], if any.
     A `SimulationError` says which contact cannot be closed.
     """
-    inverse_mass = 1 / formation.scene.mass_diagonal
-    closed = 3e-15 * formation.scene.scales.length
-    for _ in range(8):
-        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        gaps, rows = kinematics.C[0], kinematics.A[0]
-        worst = int(np.abs(gaps).argmax())
-        if np.abs(gaps[worst]) > within:
-            raise SimulationError(
-                f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
-            )
-        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
-        if np.abs(gaps[worst]) < closed and (np.abs(slid) < closed).all():
-            break
-        rows = rows if slip is None else kinematics.P[0]
-        lift = inverse_mass[:, None] * rows.T
-        try:
-            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
-        except np.linalg.LinAlgError:
-            raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
-    if not np.abs(gaps[worst]) < formation.scene.touching * 1e-3:
-        raise SimulationError(
-            f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
-        )
-    return z
+    gaps, mass = formation.evaluate(z[None], z[None]).C[0], formation.scene.mass_diagonal
+    worst = int(np.abs(gaps).argmax())
+    text = f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m,"
+    if np.abs(gaps[worst]) > within:
+        raise SimulationError(f"{text} does not touch")
+    if slip is None:
+        formation, slip = replace(formation, rolling=()), np.zeros(0)
+    closed = close_all(formation, z[None], slip, metric=mass)[0]
+    if not np.isfinite(closed).all():
+        raise SimulationError(f"{text} cannot be closed")
+    return np.asarray(closed)
 
 
 LEAST = 1e-2  # least margin over saturation of torques that hold or close

@@ -634,7 +634,7 @@ class Replay(Run):
     def _close(self, formation: Formation) -> Array:
         """The present configuration with every contact of a formation closed."""
         try:
-            return modes.close_contacts(formation, self.z, 10 * REACHED * self.system.scales.length)
+            return modes.require_closed(formation, self.z, 10 * REACHED * self.system.scales.length)
         except SimulationError as error:
             raise SimulationError(f"{error} {self.when()}") from None
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.sharing import exclusive
+from ..contacts.contact_limits import measure_gaps
 from ..problem.definition import Problem
 from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
@@ -27,7 +28,7 @@ from .events import Energies, EventKind, Outcome, OutcomeKind, Simulation, list_
 from .prescribed import Replay
 from .run import Feedback, Law, Run
 from .stepper import Modes
-from .system import SLOW, build_system, measure_gaps
+from .system import SLOW, build_system
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun

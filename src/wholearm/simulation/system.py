@@ -5,21 +5,8 @@ A pair of features has a gap C(z), whose gradient is its row of A, and a slip co
 gradient is its row of A_t: how far the features have slid over each other while they touch.
 
 What is compiled is a `Structure`, which knows of no numbers; a `System` has those of one scene.
-That of a scene (`build_system`) has all pairs of features of object, palm and links:
-
-==============  ====================================================  ========================
-name            touching                                              gap
-==============  ====================================================  ========================
-``v3-palm``     vertex 3 and the palm                                 height of the vertex
-``v3-finger1``  vertex 3 and the touching side of link 1              n . (p - base) - radius
-``v3-back1``    vertex 3 and the far side of link 1                   -n . (p - base) - radius
-``v3-tip1``     vertex 3 and the arc of tip 1                         abs(p - tip) - radius
-``v3-joint1``   vertex 3 and the circle about joint 1                 abs(p - base) - radius
-``e2-tip1``     edge 2 and tip 1                                      m . (tip - p_2) - radius
-``e2-joint1``   edge 2 and the circle about joint 1                   m . (base - p_2) - radius
-``tip1-back2``  tip 1 and a side of link 2, or its tip or joint; the  likewise, with both radii
-                same with other numbers
-==============  ====================================================  ========================
+That of a scene (`build_system`) has all pairs of features of object and hand (`elemental`), and of
+links, such as ``tip1-back2``: tip 1 and the far side of link 2.
 
 The links slide on each other without friction, as no coefficient is given for them. Tolerances of
 the simulator are relative to scales of the scene (`Scene.scales`).
@@ -36,9 +23,9 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Keeper, Store, kept_property
-from ..contacts.contact_limits import FINGERS_TOUCH, build_apart, build_finger_gap
-from ..contacts.elemental import ContactPair, Link, build_features, place_bodies
+from ..common.sharing import Batch, Keeper, kept_property
+from ..contacts.contact_limits import FINGERS_TOUCH
+from ..contacts.elemental import ContactPair, Link, place_bodies
 from ..scene.model import Scales, Scene
 
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
@@ -96,7 +83,7 @@ class Structure(Keeper):
         """Function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
         least = [ca.mmin(ca.vertcat(1e9, *pair.ranges)) for pair in self.pairs]
-        both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
+        both = ca.cse(ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least))))
         return Batch(ca.Function("gaps", [self.z, self.geometry], [both]))
 
 
@@ -207,25 +194,6 @@ def build_system(scene: Scene) -> System:
         np.array(friction),
         scene.scales,
     )
-
-
-def measure_gaps(scene: Scene, z: Array) -> Array:
-    """Gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
-
-    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
-    the largest separation in any direction, independent of the pairs.
-    """
-    return _GAPS(scene)(z)[0][..., 0]
-
-
-def _build_gaps(scene: Scene) -> Batch:
-    features = build_features(scene)
-    gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
-    gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
-    return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))
-
-
-_GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))
 
 
 @lru_cache(maxsize=16)

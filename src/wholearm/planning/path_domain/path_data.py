@@ -192,7 +192,7 @@ def prepare(
             )
             for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
         )
-    kept, rates = limits.split_speeds, formation.scene.torque_rate_limit
+    kept, rates = limits.split(2), formation.scene.torque_rate_limit
     return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
 
 

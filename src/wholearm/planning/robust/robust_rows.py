@@ -153,7 +153,7 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     point = curve.evaluate(s)
     directions = directions_of(curve, segment)
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    limits = make_limits(formation, epsilon).split_speeds[0]
+    limits = make_limits(formation, epsilon).split(2)[0]
     rows = limits.only(PRESS, CONE).rows[:, :-4]
     none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
     radii = np.array([widths[name] for name in names])

@@ -23,16 +23,8 @@ from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import describe_pose, find_tied, tangent_basis
-from ...geometry.path_guess import (
-    PathGuess,
-    close_contacts,
-    connect,
-    find_end,
-    guess_phase,
-    is_inside,
-    list_ends,
-)
-from ...mechanics.dynamics import Directions, force_rows, metric_weights
+from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, is_inside, list_ends
+from ...mechanics.dynamics import Directions, close_contacts, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
