@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table, fixed
@@ -19,7 +20,7 @@ from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import Curve, border, describe_pose, solve_tangent
+from ..geometry.curve import Curve, border, describe_pose, directions_of, solve_tangent
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
@@ -352,17 +353,16 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
             curve = replace(curve, length=RELEASE_AT * curve.length)
-        s, signs = _sample_segments(curve)
+        s, owners = _sample_segments(curve)
         point = curve.evaluate(s)
         (places, z_s, z_ss), kinematics = point[:3], point.kinematics
+        directions = directions_of(curve, owners)
     elif formation.n_constraints == 3 and count_freedoms(formation, z) == 2:
         goal = guess_phase(phase, z, later)[-1].z[-1]
         s, places, z_s, z_ss, kinematics = _straighten(formation, z, goal)
-        slip = np.einsum("nij,nj->ni", kinematics.A_t, z_s)
-        signs = np.sign(np.hstack([slip, z_s[:, 3:]]))
+        directions = Directions.of(kinematics, z_s)
     else:
         return None
-    directions = Directions(signs[:, :-2], signs[:, -2:])
     forces = inverse(formation, places, z_s, z_ss, directions, kinematics)
     limits = InternalForceLimits.of(formation, forces, z_s[:, 3:])
     inertia = reduced_inertia(formation, kinematics, directions)
@@ -370,16 +370,16 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
     return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
 
 
-def _sample_segments(curve: Curve) -> tuple[Array, Array]:
-    """Places along a curve, both ends of each segment, and directions of contacts and joints."""
-    places, signs = [], []
-    for part in curve.segments:
+def _sample_segments(curve: Curve) -> tuple[Array, NDArray[np.int64]]:
+    """Places along a curve, both ends of each segment, and the segment of each."""
+    places, owners = [], []
+    for index, part in enumerate(curve.segments):
         count = max(5, round(PLACES * (part.stop - part.start) / curve.length))
         # Denser at the ends, where motions start and stop.
         turn = (1 - np.cos(np.linspace(0.0, np.pi, count))) / 2
         places.append(part.start + turn * (part.stop - part.start))
-        signs.append(np.tile(np.concatenate([part.Xi, part.sigma]), (count, 1)))
-    return np.concatenate(places), np.vstack(signs)
+        owners.append(np.full(count, index))
+    return np.concatenate(places), np.concatenate(owners)
 
 
 def _straighten(

@@ -1,7 +1,7 @@
-"""Initial guess of a path from geometry alone: projection, ends of phases, points between.
+"""Initial guess of a path from geometry alone: ends of phases, points between.
 
-Configurations are projected onto closed contacts by Gauss-Newton. Ends of phases are found by an
-active-set method on the limits, and globally where palm and both fingers touch.
+Ends of phases are found by an active-set method on the limits, and globally where palm and both
+fingers touch.
 """
 
 from __future__ import annotations

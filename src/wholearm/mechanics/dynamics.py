@@ -19,6 +19,8 @@ nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the eq
 
 Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
 det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inertia`.
+
+Configurations are projected onto closed contacts by Gauss-Newton: `close_all`.
 """
 
 from __future__ import annotations
