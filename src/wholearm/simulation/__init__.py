@@ -5,7 +5,8 @@ Contacts are those of a problem's phases, or found by a complementarity problem 
 It shares the data model with the planner (`scene`, `contacts`, `problem`, `results`), and of what
 is computed from it these alone, each with an independent check among the tests: `compute_impact`
 and `ViolationKind` of `mechanics.impact` (plastic impacts); `Statics`, `TorquePolygon`, `GRAZE` and
-`SURE` of `mechanics.statics` (balance and closed gaps at rest); and `find_weakest` of
-`mechanics.limits`. Equations of motion, their integration, events and the choice of contact modes
-are its own.
+`SURE` of `mechanics.statics` (balance and closed gaps at rest); `find_weakest` of
+`mechanics.limits`; and `close_all` and `move_least` of `mechanics.dynamics` (projection onto closed
+contacts). Equations of motion, their integration, events and the choice of contact modes are its
+own.
 """
