@@ -205,6 +205,9 @@ def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     """Gap, rows A and A_t, A' v, slip coordinate [m] and A_t' v of a contact."""
     pair, z = build_pair(contact, scene), build_features(scene).z
     A, A_t = (ca.jacobian(value, z) for value in (pair.gap, pair.slip))
+    if contact.finger is not None and (contact.feature, contact.surface) == ("v", "tip"):
+        # The slip is that at the arc, A_t that of the vertex, wherever it is.
+        A_t *= 1 + pair.gap / scene.fingers[contact.finger].radius
     bend, slip_bend = (ca.jtimes(rows @ _V, z, _V) for rows in (A, A_t))
     return tuple(ca.cse([pair.gap, A, A_t, bend, pair.slip, slip_bend]))
 
