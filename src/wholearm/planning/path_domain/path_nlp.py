@@ -194,14 +194,15 @@ class Tightening(NamedTuple):
     limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
     speed_share: Array  # (N + 1,): factor on the largest b
     duration: float | None  # [s]: longest duration, if there is one
+    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
     motors: Array  # (N + 1, 2, 2): factors on torque rate limits and on the largest commands
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
-        count, sides = len(data.grid.s), len(data.spans)
-        motors = np.ones((count, 2, 2))
-        return Tightening(np.zeros((count, sides)), np.ones(count), duration, motors)
+        count = len(data.grid.s)
+        limits = np.zeros((count, len(data.spans)))
+        return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -441,7 +441,7 @@ class PathIterate:
         if not task.is_held and (self.meshes == 0 or costly) and self.meshes < SOLVES:
             # Neither least effort nor tightened limits show where the switches are.
             breaks, shift = self.breaks, 0.0
-            if not (task.options.goal is Objective.EFFORT or bool(self.tightening.limits.any())):
+            if not (task.options.goal is Objective.EFFORT or bool(self.tightening.missed.any())):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
                 matches = [
                     match(before, find_switches(part, motion.profile, margin), part.curve)
@@ -474,17 +474,25 @@ class PathIterate:
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
-        data, tight, duration = self.data, self.tightening, self.task.duration
+        data, tight = self.data, self.tightening
         (short, speeding), hurry, _ = self.misses
+        solution, duration = self.solution, self.task.duration
         if duration is not None:
             # The quadrature of the NLP is not that of the motion.
-            off = self.solution.duration / sum(motion.duration for motion in self.motions)
+            off = solution.duration / sum(motion.duration for motion in self.motions)
             duration *= float(np.clip(off, 0.8, 1.2))
+        # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
+        # Case: the largest margin of phase 3 of the heptagon on four contacts.
+        slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
+        least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
+        reach = np.where(short > 0, least, 0.0)
         over = 1.05  # tightening over the violation
+        added = over * data.spread_to_nodes(short)
         tighter = Tightening(
-            tight.limits + over * data.spread_to_nodes(short),
+            np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
             tight.speed_share * (1 - over * data.spread_to_nodes(speeding)),
             duration,
+            tight.missed + added,
             tight.motors * (1 - over * data.spread_to_nodes(hurry)),
         )
         return replace(self, tightening=tighter)
@@ -541,7 +549,7 @@ class PathIterate:
     def paid(self) -> Array:
         """Relative cost at each node of the tightening so far."""
         tight = self.tightening
-        return self._price(tight.limits, 1 - tight.speed_share, 1 - tight.motors)
+        return self._price(tight.missed, 1 - tight.speed_share, 1 - tight.motors)
 
     def _price(self, limits: Array, speed_share: Array, motors: Array) -> Array:
         """First-order relative cost of tightening at each node, shape (n,).
