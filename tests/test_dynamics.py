@@ -593,7 +593,7 @@ def test_a_finger_that_would_have_to_pull_is_named() -> None:
     start = trace_phases(problem)[-1].end
     feeble = problem.with_(epsilon=40.0)
     with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
-        plan_phases(feeble, feeble.phases[4:], start, COARSE, explained=False)
+        plan_phases(feeble, feeble.phases[4:], start, COARSE, thorough=False)
     assert plan_landing(time_intervals=6)
 
 
@@ -611,7 +611,7 @@ def test_one_contact_pushes_one_way_unless_the_centroid_passes_above_it() -> Non
             formation = problem.with_(friction=friction).phases[0].formation
             assert pushes_one_way(formation, z) == one_way
     with pytest.raises(InfeasibleError, match="v0-palm can only push the object one way"):
-        plan_phases(problem, problem.phases, problem.start, COARSE, explained=False)
+        plan_phases(problem, problem.phases, problem.start, COARSE, thorough=False)
     assert not pushes_one_way(landing().phases[0].formation, landing().start[None])
 
 

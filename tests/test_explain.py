@@ -132,7 +132,7 @@ def test_there_is_a_plan_with_what_is_advised_and_none_with_less() -> None:
         assert (np.abs(samples.tau) < elastic.scene.torque_limit + 1e-6).all()
     # Advice is meant to be within 2 % of what is needed.
     closer = change_limit(problem, TORQUE, 0.97 * enough)
-    short = why_not(lambda: plan_all(closer, explained=False, patient=False))
+    short = why_not(lambda: plan_all(closer, thorough=False))
     assert " short at t = " in short and "feasible with" not in short
 
 

@@ -256,11 +256,10 @@ def _plan_over_time(
 
     problem, failure = planning.problem, None
     slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
-    pinned = block[-1].index + 1 < len(problem.phases)
     for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
         free = plan_free(planning, block, z, replace(options, mode_search=complete), **over_time)
         plan: Callable[[float | None], Plans] = partial(
-            plan_with_impacts, problem, block, z, options, pinned=pinned, free=free, **over_time
+            plan_with_impacts, problem, block, z, options, free=free, **over_time
         )
         with charge(block[0].number):
             try:

@@ -130,7 +130,6 @@ class Guesses:
                 return [path(begin + share * span, order) for order in range(3)]
 
             points = _add_forces(stage.formation, stage.directions, scheme, intervals, span, follow)
-            points = points._replace(impulses=stage.guess.impulses)
             start = 0.0
             for signs, group in groupby(modes, key=lambda mode: mode.signs):
                 stop = [mode.t for mode in group][-1] / modes[-1].t
@@ -183,7 +182,7 @@ class Guesses:
                     a,
                     np.concatenate([c_n, c_t[..., rolling]], axis=2),
                     between[3],
-                    stage.guess.impulses if stop == motion.duration else np.zeros(0),
+                    np.zeros(0),
                 )
                 part = StagePoints(*map(truediv, part, units))
                 signs = np.concatenate(directions)
@@ -597,7 +596,7 @@ def guess_stages(
     The guessed duration is `falls` times that of a fall over the length of the initial paths. A
     single phase may follow the pieces of a given one, with its speed profile.
     """
-    parts = list[tuple[Phase, PathGuess, bool]]()  # in own units; whether the last of its phase
+    parts = list[tuple[Phase, PathGuess]]()  # in own units
     for k, phase in enumerate(phases):
         outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
         if parts and parts[-1][0].end is End.SMOOTH:
@@ -605,9 +604,8 @@ def guess_stages(
         z, scaled = outlines[-1].z[-1], in_own_units(problem).phases[phase.index]
         for piece in outlines:
             own_z = scale_state(piece.z, problem.scene.scales)
-            path = replace(piece, formation=scaled.formation, z=own_z)
-            parts.append((scaled, path, piece is outlines[-1]))
-    lengths = np.array([outline.length for _, outline, _ in parts])
+            parts.append((scaled, replace(piece, formation=scaled.formation, z=own_z)))
+    lengths = np.array([outline.length for _, outline in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
     total = falls * float(np.sqrt(lengths.sum()))
@@ -617,19 +615,16 @@ def guess_stages(
         clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
-    for k, (phase, outline, last) in enumerate(parts):
+    for k, (phase, outline) in enumerate(parts):
         ahead = None
         if phase.until.value is not None:
-            start = next(other.z[0] for owner, other, _ in parts if owner is phase)
+            start = next(other.z[0] for owner, other in parts if owner is phase)
             row, value = phase.until.lead(start, 1.0).poses[0]
             ahead = row, value, 1.0 if value > start[row] else -1.0
-        whole = lengths[[owner is phase for owner, _, _ in parts]].sum()
+        whole = lengths[[owner is phase for owner, _ in parts]].sum()
         intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
-        ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
-        if ends_in_impact:
-            guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
         # Limits near zero along the path, and that of the phase's end.
         near = phase.formation.evaluate_limits(outline.z).min(axis=0) < 0.02
         near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
@@ -650,11 +645,10 @@ def guess_stages(
                 phase.formation,
                 outline.directions,
                 guess,
-                until=phase.until if last and not phase.until.is_release else None,
-                ends_in_impact=ends_in_impact,
+                goal=None if phase.until.is_release else phase.until,
+                impact=phase.end is End.IMPACT and phase is not parts[-1][0],
                 monitored=tuple(sorted({*np.flatnonzero(near).tolist(), *released})),
                 released=released,
-                opens=opens,
                 opening=None if opens and before.end is End.IMPACT else options.opening,
                 clearance=options.clearance,
                 ahead=ahead,

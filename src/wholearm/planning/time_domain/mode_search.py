@@ -63,15 +63,22 @@ def in_mode(stage: Stage, mode: Mode) -> Stage:
 
 
 def link(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages with ends that follow from their modes."""
+    """Stages with ends that follow from their modes and phases."""
     linked, joints = list[Stage](), ("joint 1", "joint 2")
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
+        last = coming is None or coming.phase != stage.phase
+        until, impact = stage.goal if last else None, last and stage.impact
+        guess, count = stage.guess, coming.formation.n_constraints if coming and impact else 0
+        if len(guess.impulses) != count:
+            guess = guess._replace(impulses=np.zeros(count))
+        opens = bool(linked) and linked[-1].phase != stage.phase
+        stage = replace(stage, guess=guess, until=until, ends_in_impact=impact, opens=opens)
         turns, growing, gained = tuple[int, ...](), tuple[int, ...](), None
         fading = tuple[tuple[int, float], ...]()
         if linked and not (linked[-1].ends_in_impact or linked[-1].rests):
             contacts = linked[-1].formation.contacts
             growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in contacts)
-        if coming is not None and not stage.ends_in_impact:
+        if coming is not None and not impact:
             names = (*stage.formation.names, *joints)
             after = dict(zip((*coming.formation.names, *joints), mode_of(coming), strict=True))
             rows = enumerate(zip(names, mode_of(stage), strict=True))
@@ -80,7 +87,7 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
             fresh = new_rows(stage.formation, coming.formation)
             gained = coming.formation if fresh else None
         stage = replace(stage, gained=gained, growing=growing, fading=fading, turns=turns)
-        if rests := coming is None or (coming.phase != stage.phase and stops(stage)):
+        if rests := coming is None or (last and stops(stage)):
             fading = ()  # other torques begin after a pause
         linked.append(replace(stage, rests=rests, fading=fading))
     return linked
@@ -160,13 +167,7 @@ def _find_nearest(stage: Stage, search: TimeSearch, node: int) -> Mode | None:
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:
     """Pieces of a stage with a guess and a mode each, to be linked."""
-    pieces = list[Stage]()
-    for guess, mode in parts:
-        opens = stage.opens and not pieces
-        piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
-        pieces.append(in_mode(piece, mode))
-    pieces[-1] = replace(pieces[-1], until=stage.until, ends_in_impact=stage.ends_in_impact)
-    return pieces
+    return [in_mode(replace(stage, guess=guess), mode) for guess, mode in parts]
 
 
 def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> list[Stage]:
@@ -194,7 +195,7 @@ def merge(stages: Sequence[Stage]) -> list[Stage]:
             continue
         monitored = tuple(sorted({*before.monitored, *stage.monitored}))
         guess = _join(before.guess, stage.guess)
-        merged[-1] = replace(stage, guess=guess, opens=before.opens, monitored=monitored)
+        merged[-1] = replace(stage, guess=guess, monitored=monitored)
     return merged
 
 
@@ -208,7 +209,7 @@ def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     before = stages[index - 1] if index else None
     if coming is None or before is None or before.phase != stage.phase:
         return None
-    if coming.phase == stage.phase or not coming.opens or stage.until is not None:
+    if coming.phase == stage.phase or stage.goal is not None:
         return None
     names = stage.formation.names
     if not set(coming.formation.names) < set(names) or coming.formation.rolling:
@@ -217,27 +218,14 @@ def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     Xi, sigma = stage.directions
     guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
     directions = Directions(Xi[rows], sigma)
-    moved = replace(coming, directions=directions, guess=guess, until=None, ends_in_impact=False)
-    return [*stages[:index], moved, replace(coming, opens=False), *stages[index + 2 :]]
+    moved = replace(coming, directions=directions, guess=guess)
+    return [*stages[:index], moved, *stages[index + 1 :]]
 
 
 def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     """Stages without one of them, or None if it is all that its phase has."""
-    stage = stages[index]
-    others = [k for k, other in enumerate(stages) if other.phase == stage.phase and k != index]
-    if not others:
-        return None
-    left = list(stages)
-    if stage.opens:
-        left[index + 1] = replace(stages[index + 1], opens=True)
-    if index > 0 and (index - 1 in others) and (index + 1 not in others):
-        # The stage before ends the phase.
-        before = stages[index - 1]
-        guess = before.guess._replace(impulses=stage.guess.impulses)
-        ends = stage.ends_in_impact
-        left[index - 1] = replace(before, guess=guess, until=stage.until, ends_in_impact=ends)
-    del left[index]
-    return left
+    left = [*stages[:index], *stages[index + 1 :]]
+    return left if any(other.phase == stages[index].phase for other in left) else None
 
 
 def _join(first: StagePoints, second: StagePoints) -> StagePoints:

@@ -124,6 +124,8 @@ class Stage:
     formation: Formation
     directions: Directions
     guess: StagePoints  # initial guess; its intervals are those of the NLP
+    goal: Until | None = None  # what ends its phase; None for a release
+    impact: bool = False  # whether its phase ends in one, before another phase
     until: Until | None = None  # reached at the end; None if it ends by a reversal or a release
     turns: tuple[int, ...] = ()  # rows of (contacts, joints) whose rate is zero at the end
     gained: Formation | None = None  # the next stage's, if a constraint of it is gained softly

@@ -74,12 +74,10 @@ def plan_phases(
     to_go: CostToGo | None = None,
     ample: float = math.inf,
     fastest: Sequence[PhasePlan[Motion]] = (),
-    pinned: bool = False,
     begun: Sequence[PhasePlan[Motion]] = (),
     free: Sequence[PhasePlan[Motion]] = (),
     only_begin: bool = False,
-    explained: bool = True,
-    patient: bool = True,
+    thorough: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
     """Plan phases that are one NLP, from rest at `z` to rest.
 
@@ -89,13 +87,13 @@ def plan_phases(
     duration : [s]    longest duration of all these phases, for `margin`
     to_go             cost-to-go at a free end
     ample : [N]       saturation of the objective `margin`, as other phases keep less anyway
-    fastest           time-optimal plans from `z`, as guess for `margin`
-    pinned            whether the motion ends where these do
+    fastest           time-optimal plans from `z`, as guess for `margin`: it ends where these do if
+                      phases follow
     begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
     free              plans of the phases along curves or with free torques, to start from
     only_begin        whether to find modes on few intervals alone, without limits between points
-    explained         whether to look for a change of the problem that makes a plan possible
-    patient           whether to try other guesses than the first one
+    thorough          whether to try other guesses than the first one, and without a plan to look
+                      for a change of the problem that makes one possible
 
     Raises
     ------
@@ -107,14 +105,14 @@ def plan_phases(
     search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
     solution = _resume(search, guesses, begun) if begun else None
-    stages = list_stages(fastest)
+    stages, pinned = list_stages(fastest), phases[-1].index + 1 < len(problem.phases)
 
     def replan(parameter: Parameter, value: float) -> object:
         other = change_limit(problem, parameter.key, value)
         same = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, same, z, options.roughen(), explained=False, patient=False)
+        return plan_phases(other, same, z, options.roughen(), thorough=False)
 
-    explanation = replan if explained else None
+    explanation = replan if thorough else None
     if solution is None and free:
         guess = guesses.along(free)
         if problem.scene.has_slow_motors or problem.scene.control_period:
@@ -126,7 +124,7 @@ def plan_phases(
         solution = solution or solve_guesses(search, [guess])
     if solution is None:
         listed = iter([guesses.nearest])
-        if patient:
+        if thorough:
             listed = chain(guesses.every(), _free_ends(search, guesses))
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
@@ -251,29 +249,32 @@ def try_phases(
         if not further:
             listed = takewhile(lambda guess: not guess.homotopy, listed)
         listed = chain(listed, _free_ends(search, guesses))
-    for guess in listed:
-        solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
-        if solution.success:
-            # Of six stages of phase 3 of goal 19 of the corpus three have vanished; no plan is found
-            # from all of them.
-            search, solution = choose_end(search, drop_gone(search, solution))
-            first, *others = list_plans(search, solution._replace(attempt=guess.name))
-            return [first._replace(complete=not options.mode_search), *others]
-    return None
+    solution = solve_guesses(search, listed, most=35 if single_guess else ITERATIONS)
+    if solution is None:
+        return None
+    # Of six stages of phase 3 of goal 19 of the corpus three have vanished; no plan is found from
+    # all of them.
+    search, ended = choose_end(search, drop_gone(search, solution))
+    first, *others = list_plans(search, ended._replace(attempt=solution.attempt))
+    return [first._replace(complete=not options.mode_search), *others]
 
 
 def solve_guesses(
-    search: TimeSearch, guesses: Iterable[Guess], refuse: Callable[[], None] | None = None
+    search: TimeSearch,
+    guesses: Iterable[Guess],
+    refuse: Callable[[], None] | None = None,
+    most: int = ITERATIONS,
 ) -> TimeSolution | None:
     """The best plan from guesses that are tried in their order; None without any.
 
-    If the first ones fail, `refuse` may raise an error that says why.
+    If the first ones fail, `refuse` may raise an error that says why. `most` is as of
+    `solve_coarse`.
     """
     coarse, lost = list[TimeSolution](), list[TimeSolution]()
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
-        solution = solve_coarse(search, guess)
+        solution = solve_coarse(search, guess, most)
         if solution.success and any(is_same(solution, other) for other in lost):
             continue
         if solution.success:
@@ -569,10 +570,10 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
     if coarse is None:
         return
     stages = [
-        replace(stage, until=stage.until and scaled_phases[stage.phase].until)
+        replace(stage, goal=stage.goal and scaled_phases[stage.phase].until)
         for stage in coarse.stages
     ]
-    moved = search.solve(stages, coarse, ITERATIONS)
+    moved = search.solve(link(stages), coarse, ITERATIONS)
     if moved.success:
         yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
@@ -643,8 +644,8 @@ def plan_with_impacts(
     if not ends:
         others |= {"ample": ample, "fastest": fastest, "free": free}
         return [*plan_phases(problem, block, z, options, duration, **others)]
-    explained = plan_parts_of(problem, block, ample, free, explained=True)
-    with_stops = partial(plan_stops, explained, [0, *ends, len(block)], z)
+    thorough = plan_parts_of(problem, block, ample, free, thorough=True)
+    with_stops = partial(plan_stops, thorough, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
     if duration is not None and fastest and max(speeds) < slow:
@@ -671,15 +672,15 @@ def plan_parts_of(
     block: Sequence[Phase],
     ample: float = math.inf,
     free: Sequence[PhasePlan[Motion]] = (),
-    explained: bool = False,
+    thorough: bool = False,
 ) -> PlanPart:
-    """Planner of parts of a block: from all guesses with reasons (`explained`) or the first one."""
+    """Planner of parts of a block; `thorough` is as of `plan_phases`."""
 
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
-        plan = partial(plan_phases, ample=ample, explained=explained, patient=explained)
-        return [*plan(problem, block[start:stop], z, options, duration, free=free[start:stop])]
+        others = {"ample": ample, "free": free[start:stop], "thorough": thorough}
+        return [*plan_phases(problem, block[start:stop], z, options, duration, **others)]
 
     return plan_part
 
