@@ -346,25 +346,23 @@ class PathIterate:
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
         """Start from the minimum-time speed profile, or a parabola of the squared speed."""
-        none: Sequence[Array] = [np.zeros(0)] * len(task.curves)
-        parts, goal, fastest = task.lay_out(none, elements), task.options.goal, None
+        none = [np.zeros(0)] * len(task.curves)
+        parts, breaks = task.lay_out(none, elements), [*none]
         data = join(parts)
         profile, units = guess(data, task.options.time_weight)
-        if goal is Objective.TIME and not task.is_held:
-            fastest = find_fastest(data)
-        if fastest is None:
-            return PathIterate.on(task, (none, none), parts, units).start(profile, 0.0)
-        # Breaks at the switches, but on a curve where a fixed number of elements is too few.
-        starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-        places = np.array([switch.place for switch in fastest.switches])
-        owner, breaks = np.searchsorted(starts[1:-1], places), list[Array]()
-        for k, curve in enumerate(task.curves):
-            curve_breaks = keep_apart(curve, places[owner == k] - starts[k])
-            few = task.options.intervals and len(find_ends(curve, curve_breaks)) > elements
-            breaks.append(curve_breaks[:0] if few else curve_breaks)
-        parts = task.lay_out(breaks, elements)
-        first = PathIterate.on(task, (breaks, none), parts, units)
-        return first.start(guess_below(first.data, fastest), 0.0)
+        swept = task.options.goal is Objective.TIME and not task.is_held
+        if swept and (fastest := find_fastest(data)):
+            # Breaks at the switches, but on a curve where a fixed number of elements is too few.
+            starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
+            places = np.array([switch.place for switch in fastest.switches])
+            owner = np.searchsorted(starts[1:-1], places)
+            for k, curve in enumerate(task.curves):
+                on_curve = keep_apart(curve, places[owner == k] - starts[k])
+                if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
+                    breaks[k] = on_curve
+            parts = task.lay_out(breaks, elements)
+            profile = guess_below(join(parts), fastest)
+        return PathIterate.on(task, (breaks, none), parts, units, profile, 0.0)
 
     @staticmethod
     def on(
@@ -372,19 +370,18 @@ class PathIterate:
         edges: tuple[Sequence[Array], Sequence[Array]],
         parts: list[PhaseData],
         units: Units,
+        profile: Profile,
+        margin: float,
     ) -> PathIterate:
-        """The NLP on elements with these breaks and cuts, without a point to start from."""
+        """The NLP on elements with these breaks and cuts, near a motion and its margin [N].
+
+        Multipliers are those near the central path.
+        """
         data, (breaks, cuts) = join(parts), map(tuple, edges)
         nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), task.options.goal)
-        zero = np.zeros_like(data.grid.s)
-        first = PathSolution(Profile(zero, zero, zero), 0.0, {})
+        first = PathSolution(profile, margin, center(nlp, data, units, profile, margin))
         none = Tightening.none(data, task.duration)
         return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none)
-
-    def start(self, profile: Profile, margin: float) -> PathIterate:
-        """The same near a motion and its margin [N], with multipliers near the central path."""
-        multipliers = center(self.nlp, self.data, self.units, profile, margin)
-        return replace(self, solution=PathSolution(profile, margin, multipliers))
 
     def restart(self) -> PathIterate | None:
         """The solution on the mesh before with tightened limits, or more elements, once."""
@@ -468,9 +465,8 @@ class PathIterate:
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units)
-        made = replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
-        return made.start(profile, old.margin)
+        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units, profile, old.margin)
+        return replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""

@@ -67,7 +67,7 @@ class Guess(NamedTuple):
 
     def end_at(self, z: Array) -> Guess:
         """The same with a given end, shape (5,)."""
-        return self._replace(stages=[*self.stages[:-1], replace(self.stages[-1], stop=z)])
+        return self._replace(stages=[replace(stage, stop=z) for stage in self.stages])
 
     def by_homotopy(self) -> Guess:
         """The same path, in the modes of the friction homotopy."""

@@ -332,7 +332,7 @@ def add_stage(
 
     # The end.
     until, (end_z, end_v) = stage.until, layout.nodes[-1]
-    if stage.stop is not None:
+    if last and stage.stop is not None:
         until, N = None, tangent_basis(formation, stage.stop)
         there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
         rows.add_entries(there[:, None], end_z, N.T)
