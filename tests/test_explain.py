@@ -125,7 +125,7 @@ def test_there_is_a_plan_with_what_is_advised_and_none_with_less() -> None:
     enough = float(advised[1])
     assert enough > 0.3
     elastic = change_limit(problem, TORQUE, enough)
-    for plan in plan_all(elastic, explained=False, patient=False):
+    for plan in plan_all(elastic, thorough=False):
         t = np.linspace(0.0, plan.motion.duration, 101)
         samples = plan.motion.evaluate(t)
         assert samples.c_n.min() > elastic.epsilon - 1e-6

@@ -26,9 +26,8 @@ from ...geometry.curve import describe_pose, find_tied, tangent_basis
 from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, is_inside, list_ends
 from ...mechanics.dynamics import Directions, close_contacts, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
-from ...problem.definition import End, Phase, Problem
+from ...problem.definition import End, Phase
 from ...results.trajectory import Motion
-from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan
 from .mode_search import (
@@ -44,7 +43,7 @@ from .mode_search import (
     release_earlier,
 )
 from .solution import TimeSearch, TimeSolution
-from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
+from .stage import Scheme, Stage, StagePoints, resample, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
 GIVEN = "the contact modes that the problem gives"
@@ -246,7 +245,7 @@ class Guesses:
 
     def _follow(self, name: str, outline: PathGuess, profile: PathSpeed | None = None) -> Guess:
         """Along a path in its modes."""
-        return Guess(name, self._guess(split_path(outline), profile))
+        return Guess(name, self._guess(pieces=split_path(outline), profile=profile))
 
     def resume(self, name: str, stages: Sequence[Stage]) -> Guess:
         """From a solution with nearly the same start."""
@@ -307,20 +306,8 @@ class Guesses:
                 last, length = goal, 1.2 * length  # ratio of successive distances
         return goals
 
-    def _guess(
-        self,
-        pieces: list[PathGuess] | None = None,
-        profile: PathSpeed | None = None,
-        falls: float = FALLS,
-    ) -> list[Stage]:
-        arguments = (
-            self.search.source,
-            self.search.phases,
-            self.z,
-            self.search.scheme,
-            self.search.options,
-        )
-        return self._leave_room(guess_stages(*arguments, pieces, profile, falls))
+    def _guess(self, **path: Any) -> list[Stage]:
+        return self._leave_room(guess_stages(self.search, self.z, **path))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows: goal 50."""
@@ -582,11 +569,8 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
 
 
 def guess_stages(
-    problem: Problem,
-    phases: Sequence[Phase],
+    search: TimeSearch,
     z: Array,
-    scheme: Scheme,
-    options: PlanOptions,
     pieces: Sequence[PathGuess] | None = None,
     profile: PathSpeed | None = None,
     falls: float = FALLS,
@@ -596,14 +580,15 @@ def guess_stages(
     The guessed duration is `falls` times that of a fall over the length of the initial paths. A
     single phase may follow the pieces of a given one, with its speed profile.
     """
+    scene, phases, options = search.source.scene, search.phases, search.options
     parts = list[tuple[Phase, PathGuess]]()  # in own units
     for k, phase in enumerate(phases):
         outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
-        z, scaled = outlines[-1].z[-1], in_own_units(problem).phases[phase.index]
+        z, scaled = outlines[-1].z[-1], search.problem.phases[phase.index]
         for piece in outlines:
-            own_z = scale_state(piece.z, problem.scene.scales)
+            own_z = scale_state(piece.z, scene.scales)
             parts.append((scaled, replace(piece, formation=scaled.formation, z=own_z)))
     lengths = np.array([outline.length for _, outline in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
@@ -611,7 +596,7 @@ def guess_stages(
     total = falls * float(np.sqrt(lengths.sum()))
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
     if profile is not None:
-        total = float(profile.t[-1]) / problem.scene.scales.time
+        total = float(profile.t[-1]) / scene.scales.time
         clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
@@ -624,7 +609,8 @@ def guess_stages(
         whole = lengths[[owner is phase for owner, _ in parts]].sum()
         intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
-        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
+        along = clock[k : k + 2], ends[k : k + 2], total, profile
+        guess = _guess(outline, search.scheme, count, *along)
         # Limits near zero along the path, and that of the phase's end.
         near = phase.formation.evaluate_limits(outline.z).min(axis=0) < 0.02
         near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
@@ -633,7 +619,7 @@ def guess_stages(
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < 1e-5  # closed
             contacts = before.formation.contacts, phase.formation.contacts
-            renamed = list_renamed(problem.scene, *contacts)
+            renamed = list_renamed(scene, *contacts)
             released = tuple(
                 row
                 for row in np.flatnonzero(touching).tolist()

@@ -679,8 +679,8 @@ def plan_parts_of(
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
-        others = {"ample": ample, "free": free[start:stop], "thorough": thorough}
-        return [*plan_phases(problem, block[start:stop], z, options, duration, **others)]
+        plan = partial(plan_phases, ample=ample, thorough=thorough)
+        return [*plan(problem, block[start:stop], z, options, duration, free=free[start:stop])]
 
     return plan_part
 
