@@ -41,8 +41,8 @@ from wholearm.mapping.formation_list import (
     tolerance,
 )
 from wholearm.planning.lower_bound import bound_least_time
-from wholearm.planning.phase_plan import PhasePlan, end_of
 from wholearm.planning.time_domain.guesses import GIVEN
+from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
 from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
@@ -59,7 +59,7 @@ from wholearm.search.cuts import (
 from wholearm.search.edge_plans import (
     CoarsePlan,
     Lost,
-    PlannedPhase,
+    PartPlan,
     list_printed,
     plan_part,
     split_route,
@@ -215,10 +215,8 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
 def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     """Read again they begin with the modes and poses of that plan, but for rounding."""
     plan = solved(LANDING)
-    planned = [
-        PhasePlan(own, plan.trajectory.torque, own.duration) for own in plan.trajectory.motions
-    ]
-    pairs = list(zip(plan.problem.phases, planned, strict=True))
+    motions = (own if isinstance(own, TimeMotion) else None for own in plan.trajectory.motions)
+    pairs = zip(plan.problem.phases, motions, strict=True)
     phases = list_printed(plan.problem.scene, pairs, guesses=True)
     printed = replace(plan.problem, phases=phases)
     again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
@@ -287,17 +285,17 @@ def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
     assert tuple(edge for part in parts for edge in part) == route.edges
     assert len(parts) > 1 and not any(part[-1].in_cell for part in parts[:-1])
 
-    def plan(part: list[Edge]) -> list[PlannedPhase] | Lost:
+    def plan(part: list[Edge]) -> PartPlan | Lost:
         begin = replace(problem, start=part[0].start.z)
         return plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
 
     tasks = [partial(plan, part) for part in parts]
     for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
-        assert isinstance(one, list) and isinstance(other, list), (one, other)
+        assert isinstance(one, PartPlan) and isinstance(other, PartPlan), (one, other)
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
-        for (_, mine), (_, theirs) in zip(one, other, strict=True):
-            assert mine.motion.duration == pytest.approx(theirs.motion.duration, rel=1e-6)
-            assert end_of(mine)[0] == pytest.approx(end_of(theirs)[0], abs=1e-6)
+        assert one.duration == pytest.approx(other.duration, rel=1e-6)
+        for (mine, _), (theirs, _) in zip(one.phases, other.phases, strict=True):
+            assert dict(mine.until.pins) == pytest.approx(dict(theirs.until.pins), abs=1e-6)
 
 
 def test_edges_that_cannot_be_planned_are_named() -> None:

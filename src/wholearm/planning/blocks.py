@@ -384,10 +384,7 @@ def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
     """Estimated least time [s] of a phase with one freedom, as a function of where it begins."""
 
     def value(z: Array) -> float:
-        try:
-            return look_along((trace_phase(phase, z),), epsilon, intervals=24)
-        except NoMotionError:
-            raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
+        return ImpactSequence([phase], [trace_phase(phase, z)]).estimate(epsilon)
 
     return CostToGo(phase, value)
 
@@ -497,6 +494,15 @@ class ImpactSequence:
         numbers = [phase.number for phase in self.phases]
         curves = self.continuous_curves
         return [*plan_curves(curves, epsilon, options, numbers, duration, **others)]
+
+    def estimate(self, epsilon: float) -> float:
+        """Estimated least time [s], with stops where impacts are not possible."""
+        try:
+            curves = (part.continuous_curves for part in self.split())
+            return sum(look_along(each, epsilon, intervals=24) for each in curves)
+        except NoMotionError:
+            number = self.phases[0].number
+            raise SolverError(f"phase {number}: no motion keeps the limits") from None
 
     def list_impacts(self, plans: Plans) -> list[Transition]:
         """The impacts, with the speeds that plans of the phases pass them at."""

@@ -29,7 +29,7 @@ from ..problem.definition import Goal, Phase, Problem
 from .edge_plans import (
     CoarsePlan,
     Lost,
-    PlannedPhase,
+    PartPlan,
     RoutePart,
     list_printed,
     look_ahead,
@@ -51,8 +51,8 @@ STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
 GAIN = 0.998  # largest ratio of durations that counts as a gain
 INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-AGREES = 1 + 1e-3  # ratio of a plan of printed phases to those of the edges, above which another
-# initial guess is tried
+AGREES = 1 + 2e-3  # ratio of a plan of printed phases to the coarse ones of the edges, above which
+# another initial guess is tried
 TRIED = 6  # most routes without a plan, beyond those asked for
 BEYOND = 1.1  # largest estimate of a route over that of the best one
 NEARBY = 30  # most places of `find_first`
@@ -217,7 +217,7 @@ def search_release(
     By the least time of the edge and of a border that follows where it lands (`to_go`); `known` are
     plans that were made before.
     """
-    least, tried, others = time_with(to_go, best), set[RefinedPath](), list[CoarsePlan]()
+    least, tried, others = time_with(to_go, best), {RefinedPath(0)}, list[CoarsePlan]()
 
     def gains(path: RefinedPath) -> bool:
         """Plan a path that has not been tried; whether it is the fastest one."""
@@ -243,10 +243,6 @@ def search_release(
                 moves = (moved, -moved)
         return path._replace(move=place)
 
-    # The same place again where another end may lead on faster.
-    if to_go:
-        gains(RefinedPath(0))
-    tried.add(RefinedPath(0))
     # In motion the planner chooses the place.
     if not gains(RefinedPath(None)):
         path = shift(RefinedPath(0), STEPS)
@@ -347,14 +343,15 @@ class RoutePlanner:
         planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
         if isinstance(planned, Lost):
             return planned
-        reached = sum(plan.motion.duration for _, plan in planned)
+        found = [pair for part in planned for pair in part.phases]
+        reached = sum(part.duration for part in planned)
         before: tuple[Phase, ...] = ()
         if self.before:
             before, reached = self.before.problem.phases, self.before.duration + reached
         best: Plan | str = ""
         # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
-            phases = (*before, *list_printed(scene, planned, guesses))
+            phases = (*before, *list_printed(scene, found, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
@@ -366,8 +363,8 @@ class RoutePlanner:
 
     def _plan_parts(
         self, route: Route, problem: Problem, options: PlanOptions, report: Callable[[str], None]
-    ) -> list[PlannedPhase] | Lost:
-        """Rough plans of a route's parts, one after the other, or why one has none."""
+    ) -> list[PartPlan] | Lost:
+        """Coarse plans of a route's parts, one after the other, or why one has none."""
         coarse = self.roadmap.coarse_plans
         parts = [
             tuple((edge, coarse[edge][0] if edge.in_cell else None) for edge in part)
@@ -377,7 +374,7 @@ class RoutePlanner:
         # Several processes would tell their progress at once.
         tell, lost = report if self.jobs == 1 else Reporter(None), list[Lost]()
 
-        def plan_one(part: RoutePart) -> list[PlannedPhase] | Lost | None:
+        def plan_one(part: RoutePart) -> PartPlan | Lost | None:
             """Plan a part; None if another one has no plan."""
             begin = replace(problem, start=part[0][0].start.z)
             # Coarse plans of other motors are no guesses.
@@ -407,7 +404,7 @@ class RoutePlanner:
             if isinstance(made := known.get(keys[k]), Lost):
                 return made
         # None is lost, and so all are planned.
-        return [pair for key in keys for pair in cast(list[PlannedPhase], known[key])]
+        return [cast(PartPlan, known[key]) for key in keys]
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
@@ -463,8 +460,7 @@ class RoutePlanner:
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
-            release = partial(self._release, edge, to_go)
-            searches[edge] = partial(search_release, release, plan, to_go)
+            searches[edge] = partial(search_release, partial(self._release, edge), plan, to_go)
         roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
@@ -478,7 +474,7 @@ class RoutePlanner:
     def _share(self, tasks: Sequence[Task[T]], order: Sequence[int] = ()) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene), order)
 
-    def _release(self, edge: Edge, to_go: CostToGo | None, path: RefinedPath) -> CoarsePlan | None:
+    def _release(self, edge: Edge, path: RefinedPath) -> CoarsePlan | None:
         """Plan an edge that leaves its border at another place, or in motion."""
         place = None if path.move is None else edge.share + FINEST * path.move
         if place is not None and not INSIDE < place < 1 - INSIDE:
@@ -486,7 +482,7 @@ class RoutePlanner:
         # In motion the first guess has no plan in goal 48 of the corpus.
         guesses = {"straight": path.straight, "first_only": place is not None}
         steps = leave_at(edge, place)
-        return plan_coarsely(self.problem, edge, steps, self.options, **guesses, to_go=to_go)
+        return plan_coarsely(self.problem, edge, steps, self.options, **guesses)
 
     def _is_lost(self, route: Route) -> bool:
         """Whether a route contains edges that had no plan on another one."""

@@ -9,9 +9,9 @@ the next edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -22,12 +22,17 @@ from ..contacts.formation import Formation
 from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import CostToGo, find_headings, split_blocks, trace_phase
 from ..mechanics.dynamics import metric_weights
-from ..mechanics.speed_sweep import NoMotionError
-from ..planning.blocks import BlockPlan, Planning, estimate_time_to_go, plan_next
+from ..planning.blocks import (
+    BlockPlan,
+    ImpactSequence,
+    Planning,
+    estimate_time_to_go,
+    plan_next,
+    trace_block,
+)
 from ..planning.explain import unadvised
-from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
-from ..planning.phase_plan import PhasePlan, end_of
+from ..planning.phase_plan import PhasePlan, end_of, runs_along_curves
 from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion
@@ -37,7 +42,7 @@ from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
 from ..results.plan_record import ROLLS
 from ..scene.model import Scene
-from .edges import DEPENDENT, INTERVALS, Edge, EdgeStep, describe_steps, point_out
+from .edges import DEPENDENT, Edge, EdgeStep, describe_steps, point_out
 from .places import RoadmapPlace, close_place
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
@@ -47,7 +52,6 @@ GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the dur
 SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
 POSES = 10  # least number of them, as intervals of a first guess
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
-PlannedPhase = tuple[Phase, PhasePlan[Any]]
 
 
 class CoarsePlan(NamedTuple):
@@ -57,6 +61,14 @@ class CoarsePlan(NamedTuple):
     steps: tuple[EdgeStep, ...]  # its phases as planned
     # initial guesses: plans in the cell and of a border that is left in motion, on few intervals
     begun: list[PhasePlan[TimeMotion]]
+
+
+class PartPlan(NamedTuple):
+    """The plan of a part of a route."""
+
+    duration: float  # [s]
+    # its phases with pinned landings, and the motions of those over time
+    phases: list[tuple[Phase, TimeMotion | None]]
 
 
 RoutePart = Sequence[tuple[Edge, CoarsePlan | None]]
@@ -79,7 +91,6 @@ def plan_coarsely(
     further: bool = False,
     straight: bool = True,
     first_only: bool = False,
-    to_go: CostToGo | None = None,
 ) -> CoarsePlan | None:
     """Plan an edge through a cell alone, on few intervals; None if there is no plan.
 
@@ -89,7 +100,6 @@ def plan_coarsely(
     further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried
-    to_go       cost of what follows, with regard to which the end is chosen
     """
     from ..planning.time_domain.time_plan import try_phases
 
@@ -99,7 +109,7 @@ def plan_coarsely(
         single = replace(problem, goals=(), phases=tuple(phases))
         if len(phases) > 1 and phases[0].end is End.REST:
             curve = trace_phase(phases[0], z)
-            spent = look_along((curve,), problem.epsilon, INTERVALS)
+            spent = ImpactSequence(phases[:1], [curve]).estimate(problem.epsilon)
             z, phases = curve.end, phases[1:]
         goal = close_place(edge.stop) if len(phases) == 1 else None
         if goal is None:
@@ -109,8 +119,8 @@ def plan_coarsely(
             return None  # `until` holds already where it starts.
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only, to_go)
-    except (NoMotionError, WholearmError, np.linalg.LinAlgError):
+        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only)
+    except (WholearmError, np.linalg.LinAlgError):
         return None
     if plans is None:
         return None
@@ -144,15 +154,17 @@ def plan_phases(
     return cache[key]
 
 
-def list_printed(scene: Scene, planned: Sequence[PlannedPhase], guesses: bool) -> tuple[Phase, ...]:
+def list_printed(
+    scene: Scene, planned: Iterable[tuple[Phase, TimeMotion | None]], guesses: bool
+) -> tuple[Phase, ...]:
     """Planned phases as they are printed and read again.
 
-    With `guesses` phases over time begin with the modes and poses of their plans, rounded.
+    With `guesses` phases over time begin with the modes and poses of their motions, rounded.
     """
     phases = list[Phase]()
-    for phase, plan in planned:
-        if guesses and isinstance(plan.motion, TimeMotion):
-            phase = replace(phase, guess=_list_modes(plan.motion, scene.scales.length))
+    for phase, motion in planned:
+        if guesses and motion:
+            phase = replace(phase, guess=_list_modes(motion, scene.scales.length))
         phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED_ANGLE)))
     return tuple(phases)
 
@@ -195,8 +207,8 @@ def plan_part(
     options: PlanOptions,
     report: Callable[[str], None],
     guessed: bool = True,
-) -> list[PlannedPhase] | Lost:
-    """Rough plans of edges one after the other from the problem's start, or why there are none.
+) -> PartPlan | Lost:
+    """Plan edges one after the other from the problem's start, on few intervals; or why not.
 
     Coarse plans of edges through cells are the initial guesses if `guessed`.
     """
@@ -210,23 +222,32 @@ def plan_part(
         elif len(edge.steps) == 1 and not edge.in_cell:
             borders[len(owners) - 1] = edge
     single = replace(problem, phases=tuple(make_phases(problem, steps)), goals=())
-    planning = Planning(single, (), options.roughen(), ())
+    planning, duration = Planning(single, (), options.roughen(), ()), 0.0
+    phases = list[tuple[Phase, TimeMotion | None]]()
     try:
         with unadvised(), name_source(problem.source):
             for block in split_blocks(single):
-                known, guess = None, guesses.get(block[-1].index)
                 start = planning.blocks[-1].end if planning.blocks else problem.start
-                if guess and guessed:
-                    known = BlockPlan(block, start, list(guess), None, coarse=True)
                 if block[0].index in borders:
                     # From where the edge before lands: goal 18 of the corpus.
-                    aimed = [*single.phases]
-                    aimed[block[0].index] = _aim(block[0], start, borders[block[0].index])
-                    single = replace(single, phases=tuple(aimed))
-                    planning = replace(planning, problem=single)
-                planning = plan_next(planning, known, report)
+                    block = (_aim(block[0], start, borders[block[0].index]),)
+                if runs_along_curves(block, options):
+                    chain = trace_block(planning, block, start)
+                    duration += chain.estimate(problem.epsilon)
+                    phases += [(phase, None) for phase in block]
+                    made = BlockPlan(block, start, [], chain)
+                    planning = replace(planning, blocks=(*planning.blocks, made))
+                    continue
+                known, guess = None, guesses.get(block[-1].index)
+                if guess and guessed:
+                    known = BlockPlan(block, start, list(guess), None, coarse=True)
+                planning = plan_next(planning, known, report, coarse=True)
+                for phase, plan in zip(block, planning.blocks[-1].plans, strict=True):
+                    duration += plan.motion.duration
+                    motion = cast(TimeMotion, plan.motion)
+                    phases.append((pin_landing(phase, end_of(plan)[0]), motion))
     except (WholearmError, np.linalg.LinAlgError) as error:
-        failed = owners[len(planning.plans)]
+        failed = owners[len(phases)]
         tried = [step for step, owner in zip(steps, owners, strict=True) if owner <= failed]
         reason = str(error) if isinstance(error, WholearmError) else DEPENDENT
         lost = Lost(f"{describe_steps(tried)}: {reason}")
@@ -234,8 +255,7 @@ def plan_part(
         first = failed - (failed > 0 and edges[failed - 1][0].in_cell)
         lost.edges = tuple(edge for edge, _ in edges[first : failed + 1])
         return lost
-    pairs = zip(single.phases, planning.plans, strict=True)
-    return [(pin_landing(phase, end_of(plan)[0]), plan) for phase, plan in pairs]
+    return PartPlan(duration, phases)
 
 
 def pin_landing(phase: Phase, z: Array) -> Phase:

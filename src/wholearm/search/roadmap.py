@@ -9,10 +9,10 @@ all paths share one `LimitSet`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import NamedTuple
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
-from .edge_plans import CoarsePlan, Lost, PlannedPhase
+from .edge_plans import CoarsePlan, Lost, PartPlan
 from .edges import (
     Blocked,
     BorderEdge,
@@ -54,7 +54,6 @@ from .edges import (
     time_parts,
 )
 from .places import (
-    Key,
     RoadmapPlace,
     close_place,
     is_flush,
@@ -62,6 +61,8 @@ from .places import (
     make_place,
     measure_along,
 )
+
+T = TypeVar("T")
 
 NODES = 12  # intervals of a path
 
@@ -143,44 +144,44 @@ class Roadmap:
         self.scene, self.epsilon = problem.scene, problem.epsilon
         self.terms = Terms(problem.epsilon, uniqueness_margin)
         self.refined: set[Edge] = set()
-        self._borders: dict[tuple[Key, tuple[Contact, ...]], list[BorderEdge]] = {}
         self._curves: dict[frozenset[Contact], list[Curve]] = {}
-        self._chains: dict[Key, list[Chain]] = {}
-        self._cells: dict[Key, list[Edge]] = {}
         self.plans: dict[object, Plan | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
-        self.part_plans: dict[object, list[PlannedPhase] | Lost] = {}
+        self.part_plans: dict[object, PartPlan | Lost] = {}
         self._releases: dict[BorderEdge, list[Edge]] = {}
-        self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
+        self._known: dict[tuple[object, ...], Any] = {}
+
+    def _once(self, make: Callable[[], T], *key: object) -> T:
+        """What `make` returns, which is called the first time alone that it is asked for a key."""
+        if key not in self._known:
+            self._known[key] = make()
+        return cast(T, self._known[key])
 
     def trace(self, place: RoadmapPlace, chain: Chain | None = None) -> list[BorderEdge]:
         """Borders from a place; with a chain, only those that it may enter."""
         closed, borders = close_place(place) if place.landed else place, list[BorderEdge]()
         for formation in list_formations_at(closed, 4) if closed else ():
             if closed and (chain is None or chain.can_enter(formation)):
-                key = place.key, formation.contacts
-                if key not in self._borders:
-                    curves = self._curves.setdefault(frozenset(formation.contacts), [])
-                    self._borders[key] = follow_borders(closed, formation, self.terms, curves)
-                borders += self._borders[key]
+                curves = self._curves.setdefault(frozenset(formation.contacts), [])
+                make = partial(follow_borders, closed, formation, self.terms, curves)
+                borders += self._once(make, place.key, formation.contacts)
         return borders
 
     def follow(self, place: RoadmapPlace) -> list[Chain]:
         """Borders from a place."""
-        key = place.key
-        if key not in self._chains:
-            self._chains[key] = [Chain((), (border,), (1.0,)) for border in self.trace(place)]
-        return self._chains[key]
+        return self._once(
+            lambda: [Chain((), (border,), (1.0,)) for border in self.trace(place)], place.key
+        )
 
     def extend(self, chain: Chain) -> list[Chain]:
         """Chains with one more border entered in motion."""
-        key, last = chain.borders, chain.borders[-1]
-        if last.gained is None or len(key) == LONGEST:
+        last = chain.borders[-1]
+        if last.gained is None or len(chain.borders) == LONGEST:
             return []
-        if key not in self._longer:
-            chains = [chain.extend(border) for border in self.trace(last.stop, chain)]
-            self._longer[key] = [longer for longer in chains if longer]
-        return self._longer[key]
+        chains = self._once(
+            lambda: [chain.extend(border) for border in self.trace(last.stop, chain)], chain.borders
+        )
+        return [longer for longer in chains if longer]
 
     def set_out(
         self, place: RoadmapPlace, goal: Goal
@@ -202,7 +203,7 @@ class Roadmap:
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
         if chain.edge is not None:
             yield chain.edge, chain
-        if (ending := chain.end_at(goal)) is not None:
+        if (ending := self._once(partial(chain.end_at, goal), chain.borders, goal)) is not None:
             yield ending, None
         if isinstance(chain.edge, Blocked) and isinstance(chain.edge.reason, Unstopped):
             yield from self.go_on(chain, goal)
@@ -219,9 +220,9 @@ class Roadmap:
 
     def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
         """Edges from rest at a place through the cells around it, and to a goal inside of them."""
-        if place.key not in self._cells:
-            self._cells[place.key] = cross((place,), self.epsilon)
-        return [*self._cells[place.key], *self.end_in_cell(place, goal)]
+        edges = self._once(partial(cross, (place,), self.epsilon), "cells", place.key)
+        ends = self._once(partial(self.end_in_cell, place, goal), "cells", place.key, goal)
+        return [*edges, *ends]
 
     def release(self, border: BorderEdge, among: Sequence[BorderEdge]) -> list[Edge]:
         """Edges that leave a border for a cell, from the fastest of some places along it.
@@ -260,36 +261,36 @@ class Roadmap:
         Durations are kept; the planner decides on feasibility. A border before is left in motion:
         from rest at one place few others can be reached.
         """
-        if goal.flush is None or goal.x is None:
-            return []
-        moved, near = list[Edge](), NEAR * self.scene.scales.length
-        for edge in edges:
-            *before, last = edge.steps
-            flush = is_flush(self.scene, edge.stop.contacts, goal.flush)
-            if not flush or abs(edge.stop.z[0] - goal.x) > near:
-                continue
-            formation = Formation(self.scene, edge.stop.contacts)
-            z = close_contacts(formation, edge.stop.z, np.zeros(0), ((0, goal.x),))
-            if z is not None and is_inside(formation, z):
-                step = last._replace(until=replace(last.until, pins=(("x", goal.x),)))
-                stop = replace(edge.stop, z=z)
-                first = [EdgeStep(b.contacts, Until(), End.SMOOTH) for b in before]
-                moved.append(replace(edge, stop=stop, steps=(*first, step), left=None))
-        return moved
+        landings = (self._once(partial(self._land, edge, goal), edge, goal) for edge in edges)
+        return [landing for landing in landings if landing]
 
-    def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge]:
+    def _land(self, edge: Edge, goal: Goal) -> Edge | None:
+        """The copy of an edge that lands on a goal; None if it is another edge, or too far."""
+        *before, last = edge.steps
+        if goal.flush is None or goal.x is None:
+            return None
+        near = abs(edge.stop.z[0] - goal.x) <= NEAR * self.scene.scales.length
+        if not (near and is_flush(self.scene, edge.stop.contacts, goal.flush)):
+            return None
+        formation = Formation(self.scene, edge.stop.contacts)
+        z = close_contacts(formation, edge.stop.z, np.zeros(0), ((0, goal.x),))
+        if z is None or not is_inside(formation, z):
+            return None
+        step = last._replace(until=replace(last.until, pins=(("x", goal.x),)))
+        first = [EdgeStep(b.contacts, Until(), End.SMOOTH) for b in before]
+        return replace(edge, stop=replace(edge.stop, z=z), steps=(*first, step), left=None)
+
+    def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
         """Straight edges from a place to a goal inside a cell around it; x is sampled if free."""
         if goal.phi is None:
-            return
+            return []
         x = place.z[0] + np.linspace(-1.5, 1.5, 13) * self.scene.scales.length
         x = x if goal.x is None else np.array([goal.x])
         poses = np.column_stack([x, np.full(len(x), goal.phi)])
         pins = () if goal.x is None else (("x", goal.x),)
-        for formation in list_formations_at(place, 3):
-            until = Until(None, "phi", goal.phi, pins)
-            edge = go_to(place, formation, poses, until, self.epsilon)
-            if edge is not None:
-                yield edge
+        until, formations = Until(None, "phi", goal.phi, pins), list_formations_at(place, 3)
+        edges = (go_to(place, each, poses, until, self.epsilon) for each in formations)
+        return [edge for edge in edges if edge]
 
 
 def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:

@@ -226,7 +226,6 @@ def try_phases(
     goal: Array | None = None,
     further: bool = False,
     single_guess: bool = False,
-    to_go: CostToGo | None = None,
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
@@ -234,11 +233,10 @@ def try_phases(
     ----------
     goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
     further       whether guesses after the first ones are tried
-    single_guess  whether to solve from one guess alone, for few iterations
-    to_go         cost of what follows, for the choice of the end
+    single_guess  whether to solve from one guess alone
     """
     rough = replace(options, mode_search=False)
-    search = TimeSearch.of(problem, rough, phases, to_go=to_go, only_begins=True)
+    search = TimeSearch.of(problem, rough, phases, only_begins=True)
     guesses = Guesses(search, z)
     listed: Iterable[Guess] = guesses.every(goal)
     if single_guess:
@@ -249,13 +247,13 @@ def try_phases(
         if not further:
             listed = takewhile(lambda guess: not guess.homotopy, listed)
         listed = chain(listed, _free_ends(search, guesses))
-    solution = solve_guesses(search, listed, most=35 if single_guess else ITERATIONS)
+    solution = solve_guesses(search, listed, most=35)  # many edges have no plan
     if solution is None:
         return None
     # Of six stages of phase 3 of goal 19 of the corpus three have vanished; no plan is found from
     # all of them.
-    search, ended = choose_end(search, drop_gone(search, solution))
-    first, *others = list_plans(search, ended._replace(attempt=solution.attempt))
+    left = drop_gone(search, solution)._replace(attempt=solution.attempt)
+    first, *others = list_plans(search, left)
     return [first._replace(complete=not options.mode_search), *others]
 
 
@@ -334,9 +332,9 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     searched = solution
     if search.options.mode_search and not (search.searched or search.has_ample(solution)):
         searched = improve(search, solution)
-    if search.only_begins:
-        return searched
     search, coarse = choose_end(search, searched)
+    if search.only_begins:
+        return coarse
     refined = refine_stages(search, coarse)
     if not refined.success and search.options.mode_search and refined.status != COSTLY:
         # Phase 2 of the route of query 10 has no solution in which a contact turns back without
@@ -488,10 +486,9 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
 
     Also returns the search with the price of the last end.
     """
-    best, least = (search, solution), None
-    if search.to_go is None:
-        return best
-    for _ in range(4):  # most expansions of the cost-to-go
+    best, least = (search, solution), math.inf
+    # Most expansions of the cost-to-go.
+    for left in reversed(range(0 if search.to_go is None else 4)):
         try:
             value, price = search.expand(solution.end)
         except WholearmError:
@@ -499,9 +496,11 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
         total = solution.cost + value
         if search.price is not None:
             total -= float(search.price.gradient @ (solution.end - search.price.origin))
-        if least is not None and total > least - 1e-4 * abs(least):
+        if total >= least:
             break
-        least, best = total, (search, solution)
+        gain, least, best = least - total, total, (search, solution)
+        if not left or gain < 1e-4 * abs(total):
+            break
         search = replace(search, price=price)
         solution = search.solve(solution.stages, solution)
         if not solution.success:
