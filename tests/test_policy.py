@@ -22,6 +22,7 @@ from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajector
 from wholearm.analysis.robustness import make_trial
 from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
+from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
@@ -63,6 +64,16 @@ def plan(problem: Problem) -> Plan:
 @pytest.fixture(scope="module")
 def policy(problem: Problem, plan: Plan) -> Policy:
     return make_policy(problem, plan.trajectory)
+
+
+def test_pressing_against_a_new_contact_lifts_no_light_object() -> None:
+    corners = np.array([[0.0, 0.0], [0.07, 0.0], [0.09, 0.04], [0.05, 0.08], [0.01, 0.06]])
+    table = tomllib.loads(write_template("pentagon", vertices=corners, mass=0.3))
+    table["phases"][1]["until"] = "v0-finger2"
+    third = {"contacts": ["v0-palm", "v1-palm", "v2-finger1", "v0-finger2"], "until": {"x": 0.0263}}
+    problem = build_problem({**table, "phases": [*table["phases"], third]})
+    plan = wholearm.solve(problem, replay=False).trajectory
+    assert not verify_policy(problem, plan, make_policy(problem, plan)).failures
 
 
 def test_the_squeeze_has_the_largest_least_level() -> None:
