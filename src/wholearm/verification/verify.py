@@ -313,7 +313,9 @@ def _balance(simulation: Simulation) -> results.EnergyBalance:
     )
     losses = viscous, dry, contact, impact
     scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses))
-    relative = abs(residual) / scale if scale > 0 else 0.0
+    # Where nothing moves all are rounding, of closing the contacts at the start.
+    rounding = 1e-12 * scene.scales.force * scene.scales.length
+    relative = abs(residual) / scale if scale > rounding else 0.0
     return results.EnergyBalance(work, kinetic, potential, *losses, residual, relative)
 
 
