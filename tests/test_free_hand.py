@@ -23,13 +23,13 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.contact_limits import measure_gaps
-from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.elemental import ContactPair, parse_contact
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.system import ContactPair, Structure, System, build_system
+from wholearm.simulation.system import Structure, System, build_system
 from wholearm.verification.free import verify_free
 
 

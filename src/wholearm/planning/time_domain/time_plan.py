@@ -486,9 +486,10 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
 
     Also returns the search with the price of the last end.
     """
-    best, least = (search, solution), math.inf
-    # Most expansions of the cost-to-go.
-    for left in reversed(range(0 if search.to_go is None else 4)):
+    best, least = (search, solution), None
+    if search.to_go is None:
+        return best
+    for _ in range(4):  # most expansions of the cost-to-go
         try:
             value, price = search.expand(solution.end)
         except WholearmError:
@@ -496,11 +497,9 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
         total = solution.cost + value
         if search.price is not None:
             total -= float(search.price.gradient @ (solution.end - search.price.origin))
-        if total >= least:
+        if least is not None and total > least - 1e-4 * abs(least):
             break
-        gain, least, best = least - total, total, (search, solution)
-        if not left or gain < 1e-4 * abs(total):
-            break
+        least, best = total, (search, solution)
         search = replace(search, price=price)
         solution = search.solve(solution.stages, solution)
         if not solution.success:
