@@ -151,7 +151,9 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     begin elsewhere: they are traced alone. An error is raised only if it does not depend on where
     exactly the block before ends.
     """
-    blocks, coarse, scene = split_blocks(planning.problem), planning, planning.problem.scene
+    blocks, scene = split_blocks(planning.problem), planning.problem.scene
+    # Ends are chosen once, when the block is planned.
+    coarse = replace(planning, ahead=False)
     over_time = [not runs_along_curves(block, planning.options) for block in blocks]
     if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
         return planning
@@ -170,7 +172,7 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
             if not after or any(shortfall.share > 0.05 for shortfall in short):
                 raise
             break
-    return coarse
+    return replace(planning, blocks=coarse.blocks)
 
 
 def plan_next(
