@@ -294,8 +294,12 @@ def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
         assert isinstance(one, PartPlan) and isinstance(other, PartPlan), (one, other)
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
         assert one.duration == pytest.approx(other.duration, rel=1e-6)
-        for (mine, _), (theirs, _) in zip(one.phases, other.phases, strict=True):
+        for (mine, motion), (theirs, again) in zip(one.phases, other.phases, strict=True):
             assert dict(mine.until.pins) == pytest.approx(dict(theirs.until.pins), abs=1e-6)
+            if motion and again:
+                assert motion.duration == pytest.approx(again.duration, rel=1e-6)
+                ends = (part.evaluate(np.array([part.duration])).z for part in (motion, again))
+                assert next(ends) == pytest.approx(next(ends), abs=1e-6)
 
 
 def test_edges_that_cannot_be_planned_are_named() -> None:
