@@ -225,10 +225,8 @@ def integrate(
     contacts, parts = problem.phases[0].formation.contacts, [*curve.segments]
     y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
-        profile, polynomial = (
-            torque.cut(t, stop),
-            [torque.coefficients[piece].ravel("F"), [t, stop]],
-        )
+        profile = torque.cut(t, stop)
+        polynomial = [torque.coefficients[piece].ravel("F"), [t, stop]]
         while t < stop:
             part = parts[0]
 
