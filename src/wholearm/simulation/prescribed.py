@@ -23,7 +23,7 @@ for as long as any friction is. It counts as stuck.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
@@ -569,12 +569,28 @@ class Replay(Run):
         return self._arrive(max(self._find_remaining(), self.settling if slow else 0.0))
 
     def _find_remaining(self) -> float:
-        """Longest time to the end of a planned motion that is there early by its error [s].
+        """Time until the torques to come have slowed the motion to rest, or slow it no more [s].
 
-        It would have stopped v / a later.
+        A planned motion that is there early by its error would have ended then. Case: phase 8 of
+        query 79 with limited rates, whose deceleration is constant at first and then fades.
         """
-        stopping, longest = 2 * self._time_to_stop(), 2e-2 * self.system.scales.time
-        return min(stopping, longest) if stopping < math.inf else 0.0
+        v, longest = self.s.outputs[5:10].copy(), 2e-2 * self.system.scales.time
+        rows = modes.evaluate_rows(self.formation, self.z, v)
+        response = modes.respond(self.leg.mode, self.signs, rows, v)
+        later = self.breaks[self.piece + 1 : bisect_right(self.breaks, self.t + longest)]
+        t = np.array([self.t, *later])
+        speed = math.sqrt(self.system.mass @ v**2)
+        if response is None or not speed:
+            return 0.0
+        loads = np.column_stack([np.ones(len(t)), self.torque.at(t)])
+        slowing = -loads @ response.acceleration.T @ (self.system.mass * v) / speed
+        if slowing[0] <= 0:
+            return 0.0
+        lost = np.append(0.0, np.cumsum(np.diff(t) * (slowing[1:] + slowing[:-1]) / 2))
+        fades = np.flatnonzero(slowing <= 1e-3 * slowing[0])
+        if len(fades) and lost[fades[0]] < 2 * speed:
+            return float(t[fades[0]] - self.t)
+        return float(np.interp(speed, lost, t) - self.t)
 
     def _measure_rate(self) -> float:
         """Time derivative of the distance to the end of the phase, in units of the scene."""
