@@ -283,7 +283,7 @@ def read_lines(text: str) -> Problem:
 @cache
 def fading() -> Problem:
     """A small hexagon: its motion of the largest margin along a curve ends slowly."""
-    text = """
+    return read_lines("""
         epsilon = 0.000704
         object.mass = 0.00834
         object.vertices = [[0.0068, -0.000469], [0.00489, 0.00278], [-0.00306, 0.00417],
@@ -296,14 +296,13 @@ def fading() -> Problem:
         start = {flush = 4, x = -0.00318}
         phases = [{contacts = ["v4-palm", "v5-palm", "v0-finger1", "v3-finger2"],
             until = {x = -0.004}}]
-    """
-    return read_lines(text)
+    """)
 
 
 @cache
 def turning() -> Problem:
     """A tall pentagon between pointed tips, one of which turns onto a vertex with its link."""
-    text = """
+    return read_lines("""
         epsilon = 0.00852
         object.mass = 0.301
         object.vertices = [[-0.125, 0.925], [-0.089, 0.249], [0.0861, -0.814], [0.14, -0.808],
@@ -316,14 +315,13 @@ def turning() -> Problem:
         start = {flush = 2, x = 0.597}
         phases = [{contacts = ["v2-palm", "e4-tip1", "e1-tip2"],
             until = {contact = "v4-finger1", x = 0.424}}]
-    """
-    return read_lines(text)
+    """)
 
 
 @cache
 def reversing() -> Problem:
     """A decagon that leaves a border where its motion turns back."""
-    text = """
+    return read_lines("""
         epsilon = 0.3034
         object.mass = 20.97
         object.vertices = [[-0.1425, 0.3496], [-0.3208, 0.199], [-0.3765, -0.02752],
@@ -339,14 +337,13 @@ def reversing() -> Problem:
             until = {x = -0.4109}, end = "smooth"},
             {contacts = ["v5-palm", "v8-finger1", "v2-finger2"],
             until = {x = -0.3511, phi_deg = -6.519}}]
-    """
-    return read_lines(text)
+    """)
 
 
 @cache
 def grazing() -> Problem:
     """A quadrangle whose edge comes to a fingertip along its tangent."""
-    text = """
+    return read_lines("""
         epsilon = 0.001509
         object.mass = 0.02129
         object.vertices = [[0.1948, 0.1413], [-0.02686, 0.0126], [-0.1794, -0.1426],
@@ -359,5 +356,4 @@ def grazing() -> Problem:
         start = {flush = 2, x = 0.02019}
         phases = [{contacts = ["v2-palm", "v3-palm", "v0-finger1", "v2-finger2"],
             until = "e1-tip2"}]
-    """
-    return read_lines(text)
+    """)

@@ -21,7 +21,7 @@ from rows import each
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved, text_of
 from tiny_study import allow, measure, misbehave
 from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
-from wholearm.benchmark import STUDIES
+from wholearm.benchmark import STUDIES, precision
 from wholearm.benchmark.corpus import (
     BANDS,
     FAMILIES,
@@ -35,23 +35,6 @@ from wholearm.benchmark.corpus import (
 from wholearm.benchmark.corpus import STUDY as CORPUS
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.growth import WORK, run_work
-from wholearm.benchmark.precision import (
-    FEW,
-    LEAST_TIME,
-    NO_DRAG,
-    PLANNERS,
-    SIMULATORS,
-    SOLVED,
-    Course,
-    Instance,
-    check_plan,
-    find_least_time,
-    integrate,
-    list_instances,
-    make_course,
-    measure_error,
-    run_planner,
-)
 from wholearm.benchmark.skip import STUDY as SKIP
 from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source
@@ -498,63 +481,63 @@ def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
 
 
 FILES = (str(HEPTAGON),)
-LEAST = {LEAST_TIME: 0.0666298, NO_DRAG: 0.0663431}
+LEAST = {precision.LEAST_TIME: 0.0666298, precision.NO_DRAG: 0.0663431}
 """Least times of the fourth phase, within 1e-5."""
 TRIED = {"wholearm, curve": "1e-3", "wholearm, time": "8 x 3", "yapss": "20", "toppra": "100"}
 
 
 @lru_cache
-def phase(number: int, drag: bool = True) -> Instance:
-    return list_instances(FILES, drag)[number - 1]
+def phase(number: int, drag: bool = True) -> precision.Instance:
+    return precision.list_instances(FILES, drag)[number - 1]
 
 
 @pytest.mark.parametrize("method", TRIED)
 def test_every_planner_comes_near_the_least_time(method: str) -> None:
-    if module := PLANNERS[method].module:
+    if module := precision.PLANNERS[method].module:
         pytest.importorskip(module, reason=f"{method}: pip install 'wholearm[bench]'")
-    (study, *_) = PLANNERS[method].choices
-    instance = phase(4, study != NO_DRAG)
-    found = run_planner(instance, method, TRIED[method])
+    (study, *_) = precision.PLANNERS[method].choices
+    instance = phase(4, study != precision.NO_DRAG)
+    found = precision.run_planner(instance, method, TRIED[method])
     error, end, violation = found["errors"]
-    assert found["outcome"] == SOLVED and abs(error) < 2e-2
+    assert found["outcome"] == precision.SOLVED and abs(error) < 2e-2
     assert end < 1e-2 and violation < 2.6e-2
-    least = find_least_time(instance)
+    least = precision.find_least_time(instance)
     assert least == pytest.approx(LEAST[study], rel=1e-5)
 
 
 def test_what_a_replay_does_not_keep_is_no_solution() -> None:
-    plan = PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
-    end, _, outcome = check_plan(phase(4), plan)
-    assert outcome == SOLVED and end < 1e-8
+    plan = precision.PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
+    end, _, outcome = precision.check_plan(phase(4), plan)
+    assert outcome == precision.SOLVED and end < 1e-8
     weak = TorqueProfile(plan.breaks, 0.98 * plan.coefficients)
-    end, *_ = check_plan(phase(4), weak)
+    end, *_ = precision.check_plan(phase(4), weak)
     assert end > 1e-3
     zero = TorqueProfile(plan.breaks, 0.0 * plan.coefficients)
-    _, violation, outcome = check_plan(phase(4), zero)
+    _, violation, outcome = precision.check_plan(phase(4), zero)
     assert "contact is lost" in outcome and violation > 0.02
-    assert check_plan(phase(4), "stopped")[2] == "stopped"
+    assert precision.check_plan(phase(4), "stopped")[2] == "stopped"
 
 
 @lru_cache
-def course() -> Course:
+def course() -> precision.Course:
     """The heptagon's first phase, with a reversal on its way."""
-    found = make_course(phase(1), FEW)
+    found = precision.make_course(phase(1), precision.FEW)
     assert found is not None
     return found
 
 
 def test_reference_is_exact_and_meets_the_reversal() -> None:
     problem, torque, stretches, end = course()
-    rough, *_ = integrate(problem, torque, phase(1).curve, 2.3e-12)
-    assert measure_error(problem, rough, end) < 1e-12
+    rough, *_ = precision.integrate(problem, torque, phase(1).curve, 2.3e-12)
+    assert precision.measure_error(problem, rough, end) < 1e-12
     assert len({tuple(stretch[:6]) for stretch in stretches}) == 2  # Xi and sigma
     starts, ends = np.array(stretches)[:, -2:].T
     assert (starts[1:] == ends[:-1]).all() and starts[0] == 0.0
 
 
-@pytest.mark.parametrize("method", SIMULATORS)
+@pytest.mark.parametrize("method", precision.SIMULATORS)
 def test_every_simulator_converges_to_the_reference(method: str) -> None:
-    build, (problem, _, _, end) = SIMULATORS[method].build, course()
+    build, (problem, _, _, end) = precision.SIMULATORS[method].build, course()
     states = [build(course(), tolerance)() for tolerance in ("1e-5", "1e-9")]
-    errors = [measure_error(problem, state, end) for state in states]
+    errors = [precision.measure_error(problem, state, end) for state in states]
     assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)

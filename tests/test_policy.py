@@ -24,7 +24,7 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
+from wholearm.policy.curve_law import LAW, CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
     SETTINGS,
     find_widest,
@@ -203,15 +203,17 @@ def test_speeds_along_a_curve_are_right_between_and_at_its_nodes(policy: Policy)
         assert law.v == pytest.approx(1.0, abs=2e-3)
 
 
-def test_a_landing_goes_on_until_its_contact_stops_the_joints() -> None:
+@pytest.mark.parametrize("approach", [0.1, 0.0])
+def test_a_landing_goes_on_until_its_contact_stops_the_joints(approach: float) -> None:
+    # Without a slow motion that presses all contacts, torques at the end close the new one.
     settings = LoopSettings(1e-3, 0.0, 1e-3, 1e-3, 5e-3, 1.0, (1.0, 1.0))
     theta = np.linspace([0.0, 0.0], [0.01, 0.0], 11)
     tables = {
         "starts": np.zeros(1), "step": np.array([1e-3]), "theta": theta,
         "rates": np.zeros((11, 2)), "tau": np.full((11, 2), 0.1),
-        "gain": np.tile(50 * np.eye(2, 4), (11, 1, 1)), "push": np.array([0.5, 0.5]),
+        "gain": np.tile([[50, 0, 1, 0], [0, 50, 0, 1]], (11, 1, 1)), "push": np.full(2, 0.5),
         "still": np.array([0.02]), "ways": np.array([[0.0, 1.0]]),
-        "approach": np.array([0.1, 0.0]),
+        "approach": np.array([approach, 0.0]),
     }  # fmt: skip
     law = MotionLaw(tables, settings)
     angle, ends = np.zeros(2), 0.012  # the contact is 2 mrad beyond the end
@@ -223,6 +225,8 @@ def test_a_landing_goes_on_until_its_contact_stops_the_joints() -> None:
         if law.over:
             break
         assert law.pushes <= (angle[0] > ends - 1e-9)
+        if not approach and 12 < step < 28:
+            assert torques == pytest.approx((0.5 - LAW.closing * speed, 0.5))
     # It is held with the torques that press, without a spring across what the contact leaves free.
     assert law.pushes and step < 80 and torques == pytest.approx((0.5, 0.5))
 

@@ -45,17 +45,9 @@ from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
+from wholearm.search import cuts
 from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
 from wholearm.search.astar import Route as SearchRoute
-from wholearm.search.cuts import (
-    describe_block,
-    edge_changed,
-    explain_block,
-    find_hand,
-    find_opening,
-    list_cut,
-    list_openings,
-)
 from wholearm.search.edge_plans import (
     CoarsePlan,
     Lost,
@@ -161,7 +153,7 @@ def test_what_blocks_is_said() -> None:
     # With next to no torque nothing moves.
     own = search(Goal(flush=6), problem_of(HEPTAGON).with_(torque_limit=0.02))
     assert not list(own.run()) and len(own.reached) == 1
-    text = describe_block(own, [], "")
+    text = cuts.describe_block(own, [], "")
     assert text.startswith("nothing leads from x = 45 mm, phi = -1.984 deg to edge 6 on the palm")
     for contact in ("v3-finger1", "v1-finger1"):
         assert f"until {contact} from x = 45 mm, phi = -1.984 deg: no motion begins" in text
@@ -236,14 +228,14 @@ def test_what_is_advised_opens_the_way() -> None:
     own = search(goal, rough)
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
-    cuts = list_cut(own)
-    assert cuts and all(blocked.stop.key not in own.reached for blocked in cuts)
-    for opening in list_openings(cuts):
-        for cut, value in zip(cuts, opening.values, strict=True):
+    blocked = cuts.list_cut(own)
+    assert blocked and all(edge.stop.key not in own.reached for edge in blocked)
+    for opening in cuts.list_openings(blocked):
+        for cut, value in zip(blocked, opening.values, strict=True):
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
-                assert isinstance(edge_changed(cut, change), Edge)
-    text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
+                assert isinstance(cuts.edge_changed(cut, change), Edge)
+    text, (change,) = cuts.find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
@@ -251,7 +243,7 @@ def test_what_is_advised_opens_the_way() -> None:
     assert route.estimate == pytest.approx(float(text.split()[-2]), rel=0.05)
     coarse = PlanOptions(intervals=20)
     with advising(lambda wanted: wanted.key == "friction.palm"):
-        said = describe_block(own, [], text, lambda at: explain_block(rough, coarse, at))
+        said = cuts.describe_block(own, [], text, lambda at: cuts.explain_block(rough, coarse, at))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
 
 
@@ -263,7 +255,7 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     (goal,), told = crossing.goals, list[str]()
     own = search(goal, crossing)
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))
-    text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
+    text, (change,) = cuts.find_hand(own, crossing, PlanOptions(), 0.0, told.append)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
     assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}
     changed = crossing.with_(change.values)
@@ -271,7 +263,7 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     assert [bool(c.obstacle.any()) for c in closed] == [True, False]
 
     late = Mock(side_effect=OutOfTime)
-    text, changes = find_hand(own, crossing, PlanOptions(), 0.0, late)
+    text, changes = cuts.find_hand(own, crossing, PlanOptions(), 0.0, late)
     assert changes == () and "not reached with 0 other" in text
 
 

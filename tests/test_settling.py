@@ -23,7 +23,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.mechanics.statics import Statics
 from wholearm.planning import dwell
 from wholearm.planning.blocks import Planning, plan_block, plan_free
-from wholearm.planning.dwell import list_touching, settle_plans
+from wholearm.planning.dwell import settle_plans
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan, Plans
 from wholearm.planning.replay_check import make_table
@@ -33,7 +33,13 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import DRIVE, find_rest, maximise_margin, require_closed
+from wholearm.simulation.modes import (
+    DRIVE,
+    find_rest,
+    find_standstill,
+    maximise_margin,
+    require_closed,
+)
 from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
@@ -106,7 +112,8 @@ def test_held_ends_balance_with_all_that_touches() -> None:
         if own.settling is None:
             continue
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
-        touching, tau = list_touching(problem, phase), np.array(own.settling.tau)
+        touching = find_standstill(problem, phase, z).touching
+        tau = np.array(own.settling.tau)
         assert balances(touching, z, tau, problem.epsilon)
         assert (np.abs(tau) <= problem.scene.torque_limit * (1 + 1e-9)).all()
 

@@ -17,7 +17,7 @@ from planned import CosineMotion, LandingMotion, change, choose_squeeze, fit, fo
 from pushing import Push, Roll, pushed, rocking
 from scenes import POINTS, box, constant, falling, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
-from wholearm import End, Friction, Phase, Problem, TorqueProfile, Until, simulate, verify
+from wholearm import Contact, End, Friction, Phase, Problem, TorqueProfile, Until, simulate, verify
 from wholearm.contacts.closing import close_finger
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.tracing import trace_phases
@@ -26,7 +26,12 @@ from wholearm.mechanics.impact import solve_impulses
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import StartDeparture, find_rest
+from wholearm.simulation.modes import (
+    StartDeparture,
+    find_rest,
+    find_standstill,
+    maximise_margin,
+)
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:
@@ -602,6 +607,28 @@ def test_a_vertex_goes_on_from_link_to_tip_at_speed(early: float) -> None:
     assert simulation.outcome.reached
     # Torques that are off for so short a time have turned nothing by more than that at 10 rad/s.
     assert np.allclose(simulation.z[-1], simulate(problem, torque).z[-1], atol=1e-6, rtol=0)
+
+
+def test_a_start_shows_once_its_acceleration_exceeds_rounding() -> None:
+    """Balance is lost a little earlier: the palm's contact is on the verge of sliding, too."""
+    corners = [[0.0499, -0.0031], [0.0268, 0.0422], [-0.0236, 0.0441]]
+    corners += [[-0.049, 0.0098], [-0.0252, -0.0432], [0.0316, -0.0387]]
+    phases = [{"contacts": ["v1-palm", "v2-finger1", "v5-finger2"], "until": {"x": 0.07}}]
+    start = {"flush": 1, "x": 0.0658}
+    problem = problem_of(HEXAGON).with_({"vertices": corners, "start": start, "phases": phases})
+    torques = [[0.1185525643378136, 0.04320277349437667, -0.00030286699521259175]]
+    torques += [[-1.1310188153889746, -0.5855907965602957, 7.361256049165377e-11]]
+    rest = find_rest(problem.phases[0].formation, problem.start)
+    departure = rest.wait(np.array(torques), -1.0)
+    assert isinstance(departure, StartDeparture) and departure.x < -1 + 1e-5
+
+
+def test_what_is_beyond_the_end_of_a_link_does_not_touch() -> None:
+    problem = problem_of(HEXAGON)
+    phase = replace(problem.phases[0], until=Until(Contact("v", 3, "finger", 1)))
+    place = find_standstill(problem, phase, problem.start)
+    assert set(place.touching.names) == {*phase.formation.names, "v2-finger1"}
+    assert maximise_margin(np.ones(2), np.array([[-np.inf, 1.0, 0.0]])) is None
 
 
 @pytest.mark.parametrize("early", (1e-7, 5e-7))

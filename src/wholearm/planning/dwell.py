@@ -41,7 +41,14 @@ from ..results.dwell_record import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
-from ..simulation.modes import Hold, Standstill, find_hold, find_opening, require_closed
+from ..simulation.modes import (
+    Hold,
+    Standstill,
+    find_hold,
+    find_opening,
+    find_standstill,
+    require_closed,
+)
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
 from .options import Objective, PlanOptions
@@ -173,8 +180,8 @@ def settle_plans(problem: Problem, plans: Plans) -> Plans:
     places = list[Standstill | None]()  # where phases come to rest
     for phase, plan in zip(problem.phases, plans, strict=True):
         z, v = end_of(plan)
-        place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
-        places.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
+        slow = build_system(problem.scene).is_slower(v, SLOW)
+        places.append(find_standstill(problem, phase, z) if slow else None)
     if problem.settle_share:
         ends = share_time(problem, plans, places)
     else:
@@ -255,16 +262,6 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
         parts=hold.parts,
         warning="" if hold.speed or firm else f"no torques {text} would drive it on to {name}",
     )
-
-
-def list_touching(problem: Problem, phase: Phase) -> Formation:
-    """All contacts where a phase ends: its own, the one gained, and those of the next phase."""
-    contacts = list(phase.formation.contacts)
-    if phase.until.contact is not None:
-        contacts.append(phase.until.contact)
-    following = problem.phases[phase.number : phase.number + 1]
-    contacts += [contact for next_phase in following for contact in next_phase.formation.contacts]
-    return Formation(problem.scene, tuple(dict.fromkeys(contacts)))
 
 
 # Dwell times of the first end that gains a contact and of the plan's last end, over those of the

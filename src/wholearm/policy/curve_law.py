@@ -61,6 +61,7 @@ class LawSettings:
     # the joints go on beyond the end [s]. Case: hexagon, phase 7, ends 0.3 mm before its contact.
     stop: float = 10.0
     reach: float = 0.1
+    closing: float = 0.25  # damping of joints while a contact closes, over the critical one
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
     # reference force, over the mean of all.
     smooth: float = 0.3
@@ -445,6 +446,7 @@ class MotionLaw:
         self.push, self.approach = tables["push"].tolist(), tables["approach"].tolist()
         self.ways = tables["ways"].tolist()
         self.end = self.every * (len(self.theta) - 1)
+        self.lands = len(self.ways) < 2
         # The next law, if along a curve: it presses its contacts before it begins.
         self.after: CurveLaw | None = None
         self.begin()
@@ -474,7 +476,7 @@ class MotionLaw:
             self.held += settings.period if self.pushes else 0.0
             stands = stands or self.held > LAW.creep * settings.dwell
             self.rested = self.rested + settings.period if stands else 0.0
-            made = self.rested > LAW.stop * settings.period or not any(self.approach)
+            made = self.rested > LAW.stop * settings.period or not self.lands
             if made and not self.pushes:
                 self.pushes, self.rested = True, 0.0
             self.over = self.pushes and self.rested > settings.dwell + settings.delay
@@ -490,14 +492,18 @@ class MotionLaw:
         k, share = self._locate(now + lead)
         torques = []
         beyond = min(max(now - self.end, 0.0), LAW.reach)
+        push = self.pushes or (now >= self.end and not any(self.approach))
         if self.pushes:
             one, two = self._hold(one, two)
+        elif push:
+            one = two = 0.0
+            fast_one, fast_two = LAW.closing * fast_one, LAW.closing * fast_two
         else:
             one, two = one - beyond * self.approach[0], two - beyond * self.approach[1]
         for row in (0, 1):
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
-                first = after = (self.push if self.pushes else self.tau[-1])[row]
+                first = after = (self.push if push else self.tau[-1])[row]
             a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
             most = settings.limit[row]
@@ -507,15 +513,15 @@ class MotionLaw:
         return torques[0], torques[1]
 
     def _hold(self, one: float, two: float) -> tuple[float, float]:
-        """Angle errors at the end, once at rest plus integrals along free displacements.
+        """Angle errors along displacements that are free at the end, once at rest plus integrals.
 
-        Where the contact was looked for, those across free displacements are errors of geometry.
+        Those across them are errors of geometry.
         """
-        free_one, free_two = (0.0, 0.0) if any(self.approach) else (one, two)
+        free_one = free_two = 0.0
         for k, (p, q) in enumerate(self.ways):
             off = p * one + q * two
             self.left[k] += 30.0 * self.settings.period * off if self.over else 0.0
-            off = self.left[k] + (off if any(self.approach) else 0.0)
+            off += self.left[k]
             free_one, free_two = free_one + p * off, free_two + q * off
         return free_one, free_two
 

@@ -35,7 +35,7 @@ from ..problem.definition import ROWS, End, Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
-from ..simulation.modes import Standstill, find_hold
+from ..simulation.modes import find_hold, find_standstill
 
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
 APPROACH = 4.0  # joint speed beyond the end, over that which counts as none
@@ -43,6 +43,9 @@ STILL = 1e-3  # speed that counts as none, over the scene's
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
 SIGNS = {"+": 1.0, "-": -1.0, "rolls": 0.0}
+# From how far open the torques at the end close a contact, over the scene's length. Case: query 26,
+# phase 4, whose landing ends 0.3 mm before its contact.
+GAP = 0.015
 WORTH = 0.02  # angle error that is worth a whole torque limit in the cost [rad]
 DAMPING = 0.3  # of the inverse of Theta, which is 1 where the joints alone move. Case: heptagon
 # Margin for feedback: normal force over the scene's unit, share of a torque limit. Case: heptagon.
@@ -301,10 +304,8 @@ def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
 
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     """Torques that hold all contacts at the end of a phase at rest, or None."""
-    contact = phase.until.contact
-    touching = replace(phase.formation.add(contact), rolling=())
-    place = Standstill(z, phase.formation, contact, touching)
-    hold = find_hold(place, problem.epsilon, problem.gap, 0.02)
+    place, gap = find_standstill(problem, phase, z), GAP * problem.scene.scales.length
+    hold = find_hold(place, problem.epsilon, gap, 0.02)
     return None if hold is None else hold.tau
 
 

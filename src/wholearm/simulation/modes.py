@@ -51,6 +51,7 @@ from ..mechanics.dynamics import close_all, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
+from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
 from .stepper import Modes
 from .system import ROUNDING_FORCE, STILL, ContactRows, build_system
@@ -410,7 +411,7 @@ class Rest:
         values = rows[:, :1] + rows[:, 1:] @ torques
         consistent = np.logical_and.reduceat(values >= 0, first, axis=0).T
         for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
-            if start > loss:
+            if start > loss + LATE:
                 break
             modes = [every[k] for k in np.flatnonzero(chosen)]
             for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
@@ -524,6 +525,9 @@ def require_closed(
 
 LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
+# Of half a piece of torques: how long after balance is lost a start may show, as accelerations have
+# to exceed rounding. Case: phase 1 of query 50 with limited rates.
+LATE = 1e-6
 DRIVE = 0.02  # least acceleration towards an open contact, ample sliding, over the scene's
 _SMALL = 1e-9  # relative rate at which a contact does not part
 
@@ -535,6 +539,21 @@ class Standstill(NamedTuple):
     formation: Formation  # that it stops in
     gained: Contact | None  # what it stops at
     touching: Formation  # all that touches
+
+
+def find_standstill(problem: Problem, phase: Phase, z: Array) -> Standstill:
+    """Where a phase stops at z, (5,), and what touches: its contacts, the gained, the next phase's.
+
+    What is beyond the end of a link or an edge does not: phase 4 of query 61 gains an edge under
+    the name of its vertex, which is 65 mm beyond the tip.
+    """
+    gained, following = phase.until.contact, problem.phases[phase.number : phase.number + 1]
+    contacts = [*phase.formation.contacts, *([gained] if gained is not None else [])]
+    contacts += [contact for later in following for contact in later.formation.contacts]
+    system = build_system(problem.scene)
+    inside = dict(zip(system.names, system.look(z)[1].tolist(), strict=True))
+    near = [c for c in dict.fromkeys(contacts) if inside[c.name] > -problem.scene.touching]
+    return Standstill(z, phase.formation, gained, Formation(problem.scene, tuple(near)))
 
 
 class Hold(NamedTuple):
@@ -667,6 +686,8 @@ def maximise_margin(
     from scipy.optimize import linprog
 
     sides = np.vstack([rows, np.zeros((0, 3)) if bounds is None else bounds])
+    if not np.isfinite(sides).all():
+        return None  # nothing can be held: new polygon 35, phase 3
     sides = np.column_stack([sides, np.arange(len(sides)) < len(rows)])
     sides /= np.abs(sides).max(axis=1)[:, None]
     answer: Any = linprog(
