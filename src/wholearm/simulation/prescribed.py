@@ -366,7 +366,6 @@ class Replay(Run):
         if self.problem.scene.has_slow_motors:
             # Rate-limited torques do not step. A motion whose deceleration fades comes early by
             # about the cube root of its error: the old torques act until it was to end.
-            remaining = remaining if self.breaks[self.piece] < self.t < self.stop else 0.0
             self.held_until = max(self.held_until, min(self.t + remaining, self.breaks[-1]))
             self.settled_by = self.held_until + self.rest_window
         return Stop.PHASE
@@ -569,28 +568,35 @@ class Replay(Run):
         return self._arrive(max(self._find_remaining(), self.settling if slow else 0.0))
 
     def _find_remaining(self) -> float:
-        """Time until the torques to come have slowed the motion to rest, or slow it no more [s].
+        """Time until the torques to come slow the motion no more, or have stopped it [s].
 
-        A planned motion that is there early by its error would have ended then. Case: phase 8 of
-        query 79 with limited rates, whose deceleration is constant at first and then fades.
+        A planned motion that is there early by its error, or has stopped just short of its end,
+        would have ended then. A deceleration that fades linearly from a takes 2 v / a, which is
+        sqrt(6 d / a) for the distance d; one that fades later is that of the next phase. Cases:
+        phase 8 of query 79 and phase 14 of query 5 with limited rates.
         """
         v, longest = self.s.outputs[5:10].copy(), 2e-2 * self.system.scales.time
         rows = modes.evaluate_rows(self.formation, self.z, v)
         response = modes.respond(self.leg.mode, self.signs, rows, v)
+        speed = math.sqrt(self.system.mass @ v**2)
+        if response is None or not speed or not self.rate:
+            return 0.0
         later = self.breaks[self.piece + 1 : bisect_right(self.breaks, self.t + longest)]
         t = np.array([self.t, *later])
-        speed = math.sqrt(self.system.mass @ v**2)
-        if response is None or not speed:
-            return 0.0
         loads = np.column_stack([np.ones(len(t)), self.torque.at(t)])
-        slowing = -loads @ response.acceleration.T @ (self.system.mass * v) / speed
-        if slowing[0] <= 0:
+        away = math.copysign(1.0, self.rate) * self.system.mass * v / speed
+        slowing = loads @ response.acceleration.T @ away
+        if slowing[0] <= 1e-2 * np.abs(slowing).max():
             return 0.0
+        # A millionth of the scene's length is what a plan and its replay differ by.
+        left = max(abs(self.distance) - 1e-6 * self.leg.until_unit, 0.0) * speed / abs(self.rate)
+        latest = 1.1 * max(2 * speed / slowing[0], math.sqrt(6 * left / slowing[0]))
+        fades = t[slowing <= 1e-3 * slowing[0]]
+        if len(fades) and fades[0] - self.t <= latest:
+            return float(fades[0] - self.t)
         lost = np.append(0.0, np.cumsum(np.diff(t) * (slowing[1:] + slowing[:-1]) / 2))
-        fades = np.flatnonzero(slowing <= 1e-3 * slowing[0])
-        if len(fades) and lost[fades[0]] < 2 * speed:
-            return float(t[fades[0]] - self.t)
-        return float(np.interp(speed, lost, t) - self.t)
+        lost = np.maximum.accumulate(lost)
+        return float(np.interp(speed, lost, t) - self.t) if speed < lost[-1] else 0.0
 
     def _measure_rate(self) -> float:
         """Time derivative of the distance to the end of the phase, in units of the scene."""
