@@ -24,7 +24,7 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.policy.curve_law import LAW, CurveLaw, LoopSettings, MotionLaw, choose_internal_force
+from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
     SETTINGS,
     find_widest,
@@ -226,7 +226,7 @@ def test_a_landing_goes_on_until_its_contact_stops_the_joints(approach: float) -
             break
         assert law.pushes <= (angle[0] > ends - 1e-9)
         if not approach and 12 < step < 28:
-            assert torques == pytest.approx((0.5 - LAW.closing * speed, 0.5))
+            assert torques == pytest.approx((0.5 - speed, 0.5))
     # It is held with the torques that press, without a spring across what the contact leaves free.
     assert law.pushes and step < 80 and torques == pytest.approx((0.5, 0.5))
 

@@ -61,7 +61,6 @@ class LawSettings:
     # the joints go on beyond the end [s]. Case: hexagon, phase 7, ends 0.3 mm before its contact.
     stop: float = 10.0
     reach: float = 0.1
-    closing: float = 0.25  # damping of joints while a contact closes, over the critical one
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
     # reference force, over the mean of all.
     smooth: float = 0.3
@@ -446,7 +445,7 @@ class MotionLaw:
         self.push, self.approach = tables["push"].tolist(), tables["approach"].tolist()
         self.ways = tables["ways"].tolist()
         self.end = self.every * (len(self.theta) - 1)
-        self.lands = len(self.ways) < 2
+        self.lands = len(self.ways) < 2  # a contact that is gained leaves less free
         # The next law, if along a curve: it presses its contacts before it begins.
         self.after: CurveLaw | None = None
         self.begin()
@@ -497,7 +496,6 @@ class MotionLaw:
             one, two = self._hold(one, two)
         elif push:
             one = two = 0.0
-            fast_one, fast_two = LAW.closing * fast_one, LAW.closing * fast_two
         else:
             one, two = one - beyond * self.approach[0], two - beyond * self.approach[1]
         for row in (0, 1):
