@@ -43,8 +43,8 @@ STILL = 1e-3  # speed that counts as none, over the scene's
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
 SIGNS = {"+": 1.0, "-": -1.0, "rolls": 0.0}
-# From how far open the torques at an end close its contact, over the scene's length. Case: query 48,
-# phase 6, with a fifth of it.
+# From how far open torques at an end close its contact, over the scene's length. Case: with a fifth
+# of it query 48, phase 6.
 GAP = 0.015
 WORTH = 0.02  # angle error that is worth a whole torque limit in the cost [rad]
 DAMPING = 0.3  # of the inverse of Theta, which is 1 where the joints alone move. Case: heptagon
