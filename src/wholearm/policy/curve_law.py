@@ -491,17 +491,17 @@ class MotionLaw:
         k, share = self._locate(now + lead)
         torques = []
         beyond = min(max(now - self.end, 0.0), LAW.reach)
-        push = self.pushes or (now >= self.end and not any(self.approach))
+        closes = self.pushes or (now >= self.end and not any(self.approach))
         if self.pushes:
             one, two = self._hold(one, two)
-        elif push:
+        elif closes:
             one = two = 0.0
         else:
             one, two = one - beyond * self.approach[0], two - beyond * self.approach[1]
         for row in (0, 1):
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
-                first = after = (self.push if push else self.tau[-1])[row]
+                first = after = (self.push if closes else self.tau[-1])[row]
             a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
             most = settings.limit[row]

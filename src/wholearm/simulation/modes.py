@@ -548,7 +548,7 @@ def find_standstill(problem: Problem, phase: Phase, z: Array) -> Standstill:
     the name of its vertex, which is 65 mm beyond the tip.
     """
     gained, following = phase.until.contact, problem.phases[phase.number : phase.number + 1]
-    contacts = [*phase.formation.contacts, *([gained] if gained is not None else [])]
+    contacts = list(phase.formation.add(gained).contacts)
     contacts += [contact for later in following for contact in later.formation.contacts]
     system = build_system(problem.scene)
     inside = dict(zip(system.names, system.look(z)[1].tolist(), strict=True))

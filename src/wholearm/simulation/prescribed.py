@@ -345,10 +345,11 @@ class Replay(Run):
         text = f"{goal} is reached at t = {self.t:.5g} s, the end of phase {len(phases)}"
         return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
 
-    def _arrive(self, window: float) -> Ending:
+    def _arrive(self, window: float, stepped: bool = False) -> Ending:
         """End the phase; if it ends at rest the motion stops, with a plastic impact if need be.
 
-        If the next break of the torques is within the `window` [s], the arrival belongs to it.
+        If the next step of the torques, or their end, comes within the `window` [s], or before the
+        motion was to end, the arrival belongs to it; the latter not if they have just `stepped`.
         """
         until, following = self.phase.until, self.following
         self.note(EventKind.ARRIVAL, f"{until} reached", str(until), -self.rate)
@@ -361,6 +362,7 @@ class Replay(Run):
         remaining = self._find_remaining()
         self.set_velocity(0.0)
         # The torques of the phase that has ended go on until they step, or end.
+        window = window if stepped else max(window, remaining)
         coming = min(self.coming_step, self.breaks[-1])
         self.held_until = coming if coming - self.t <= window else self.t
         if self.problem.scene.has_slow_motors:
@@ -528,8 +530,7 @@ class Replay(Run):
             # Before a step that is still to come, the torques are those of the phase that ends.
             stepped = self.next_piece() and self.steps_at[self.piece]
             # Phase 10 of query 32 is there two breaks before its end.
-            longest = max(self.rest_window, self._find_remaining())
-            return self._arrive(self.settling if stepped else longest)
+            return self._arrive(self.settling if stepped else self.rest_window, bool(stepped))
         if self.t >= self.breaks[-1]:
             return self.run_out()
         self.next_piece()
@@ -564,8 +565,7 @@ class Replay(Run):
 
     def _reach(self) -> Ending:
         """The end of the phase is reached while moving."""
-        slow = abs(self._measure_rate()) < SLOW
-        return self._arrive(max(self._find_remaining(), self.settling if slow else 0.0))
+        return self._arrive(self.settling if abs(self._measure_rate()) < SLOW else 0.0)
 
     def _find_remaining(self) -> float:
         """Time until the torques to come slow the motion no more, or have stopped it [s].
@@ -576,10 +576,12 @@ class Replay(Run):
         phase 8 of query 79 and phase 14 of query 5 with limited rates.
         """
         v, longest = self.s.outputs[5:10].copy(), 2e-2 * self.system.scales.time
+        speed = math.sqrt(self.system.mass @ v**2)
+        if not speed or not self.rate:
+            return 0.0
         rows = modes.evaluate_rows(self.formation, self.z, v)
         response = modes.respond(self.leg.mode, self.signs, rows, v)
-        speed = math.sqrt(self.system.mass @ v**2)
-        if response is None or not speed or not self.rate:
+        if response is None:
             return 0.0
         later = self.breaks[self.piece + 1 : bisect_right(self.breaks, self.t + longest)]
         t = np.array([self.t, *later])
