@@ -45,14 +45,8 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
-from wholearm.simulation.complementarity import (
-    ContactAnswer,
-    ContactProblem,
-    list_answers,
-    solve_lcp,
-    solve_problem,
-)
-from wholearm.verification.verdict import find_wedged
+from wholearm.simulation import complementarity
+from wholearm.verification.verdict import find_uniqueness_margin, find_wedged
 from wholearm.verification.verify import reduce_to_first_joint
 
 State = tuple[Formation, Array, Array, Directions]
@@ -414,7 +408,7 @@ def test_positive_semidefinite_problems_are_solved(skew: float) -> None:
         M = root @ root.T + turn - turn.T
         z = np.maximum(rng.normal(size=n), 0)
         w = np.where(z > 0, 0.0, np.maximum(rng.normal(size=n), 0))
-        found, residual = solve_lcp(M, w - M @ z)
+        found, residual = complementarity.solve_lcp(M, w - M @ z)
         slack, rounding = M @ (found - z) + w, 1e-9 * np.abs(M).sum()
         assert residual < rounding
         assert found.min() >= 0 and slack.min() >= -rounding
@@ -424,21 +418,22 @@ def test_positive_semidefinite_problems_are_solved(skew: float) -> None:
 def test_ties_do_not_cycle() -> None:
     # Every row falls as much as every other.
     n = 8
-    _, residual = solve_lcp(np.ones((n, n)) + np.triu(np.ones((n, n)), 1), -np.ones(n))
+    M = np.ones((n, n)) + np.triu(np.ones((n, n)), 1)
+    _, residual = complementarity.solve_lcp(M, -np.ones(n))
     assert residual < 1e-12
 
 
-def draw(rng: np.random.Generator, mu: float) -> ContactProblem:
+def draw(rng: np.random.Generator, mu: float) -> complementarity.ContactProblem:
     """Three contacts, the first two of which may stick, and a joint, on five coordinates."""
     A, A_t = rng.normal(size=(2, 3, 5))
     G, T = A.copy(), np.vstack([A_t[:2], np.eye(5)[3]])
     G[2] -= mu * rng.choice([-1.0, 1.0]) * A_t[2]
     lift, (b_n, b_t) = rng.uniform(0.5, 2.0, 5), rng.normal(size=(2, 3))
     bounds = np.array([mu, mu, 0.0]), np.array([0.0, 0.0, 0.3])
-    return ContactProblem(lift, A, G, b_n, T, b_t, np.array([0, 1, -1]), *bounds)
+    return complementarity.ContactProblem(lift, A, G, b_n, T, b_t, np.array([0, 1, -1]), *bounds)
 
 
-def check(p: ContactProblem, answer: ContactAnswer) -> None:
+def check(p: complementarity.ContactProblem, answer: complementarity.ContactAnswer) -> None:
     """Coulomb's law and complementarity, from the forces alone."""
     change = p.lift * (p.G.T @ answer.c_n + p.T.T @ answer.f)
     r_n, r_t = p.b_n + p.A @ change, p.b_t + p.T @ change
@@ -454,7 +449,7 @@ def test_lemke_finds_one_of_all_answers() -> None:
     rng = np.random.default_rng(5)
     for _ in range(40):
         problem = draw(rng, 0.15)
-        found, every = solve_problem(problem), list_answers(problem)
+        found, every = complementarity.solve_problem(problem), complementarity.list_answers(problem)
         assert found is not None and every
         check(problem, found)
         for answer in every:
@@ -538,6 +533,12 @@ def test_replays_tell_the_uniqueness_margin_of_each_phase() -> None:
     np.testing.assert_allclose(found, planned, atol=5e-3)
     strict = verify(box(), tipped(), uniqueness_margin=0.9)
     assert not strict.ok and strict.failures[0].startswith("ambiguous: ")
+    for phase, least in zip(box().phases, planned, strict=True):
+        rows, within = np.flatnonzero(tipped().phase == phase.index), tipped().c_t.copy()
+        within[rows[[0, 80]]] *= 0.5  # in their cones: at rest that is indeterminate
+        other = replace(tipped(), c_t=within)
+        margins = [find_uniqueness_margin(phase, other, part) for part in (rows[:80], rows[80:])]
+        assert margins[0] and margins[1] and margins[0].value >= least > margins[1].value
 
 
 @pytest.mark.parametrize("path", [BOX, IMPACTS], ids=lambda path: path.stem)

@@ -15,6 +15,7 @@ from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import describe_pose
 from ..mechanics import UNIQUENESS
+from ..mechanics.dynamics import metric_weights
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem, Until
@@ -28,6 +29,7 @@ DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
 STRAY = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
+STILL = 1e-9  # relative speed of rest but for rounding
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 
@@ -182,17 +184,20 @@ def find_uniqueness_margin(
     """The least uniqueness margin in a phase; None if nothing moved.
 
     Tangential forces tell which way a contact slides; one that leans on no side of its cone sticks.
+    Forces within cones at rest do not count: they are statically indeterminate, see `find_wedged`.
     `rows` are its rows in the phase.
     """
     formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
+    scene = formation.scene
     columns = [motion.contacts.index(name) for name in formation.names]
-    determined = ~np.isnan(motion.c_n[rows][:, columns]).any(axis=1)
-    rows = rows[determined]
-    if not len(rows):
-        return None
     c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
     slides = np.abs(c_t) >= (1 - 1e-6) * formation.friction * np.abs(c_n)
-    Xi = -np.sign(c_t * c_n)
+    # Case: phase 9 of query 44 under rate limits.
+    moves = motion.z_dot[rows] ** 2 @ metric_weights(scene) > (STILL * scene.scales.speed) ** 2
+    counted = ~np.isnan(c_n).any(axis=1) & (moves | slides.all(axis=1))
+    if not counted.any():
+        return None
+    rows, slides, Xi = rows[counted], slides[counted], -np.sign(c_t * c_n)[counted]
     kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
     margins = []
     for pattern in sorted(set(map(tuple, slides.tolist()))):
