@@ -34,8 +34,7 @@ from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_alo
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_path_nlp
-from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.path_domain.path_plan import LimitShape, PathNLP, plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.results.trajectory import Samples
@@ -317,8 +316,10 @@ class Stopped:
 
 
 def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = path_plan.build_path_nlp
+
     def build(shape: LimitShape, intervals: int, goal: Objective) -> PathNLP:
-        nlp = build_path_nlp(shape, intervals, goal)
+        nlp = original(shape, intervals, goal)
         stopped = Stopped(nlp.solver.function)
         return replace(nlp, solver=stopped, starter=stopped) if goal is Objective.TIME else nlp
 

@@ -50,8 +50,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
 from ..planning.path_domain.path_motion import NODES, PathMotion, Profile, lay_out
-from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp, guess
-from ..planning.path_domain.path_plan import plan_curves
+from ..planning.path_domain.path_plan import LimitShape, build_path_nlp, guess, plan_curves
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem

@@ -32,7 +32,7 @@ from ..mechanics.dynamics import metric_weights
 from ..mechanics.limits import LimitSet
 from ..planning.blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from ..planning.options import Objective, PlanOptions
-from ..planning.path_domain import path_data, path_motion, path_nlp, path_plan
+from ..planning.path_domain import path_data, path_motion, path_plan
 from ..planning.phase_plan import combine
 from ..planning.result import UNITS
 from ..planning.time_domain import solution, stage, time_nlp
@@ -163,9 +163,9 @@ def _evaluate_path(
         moved = path_motion.lay_out(edges, segment, grid.rests, grid.held)
         parts.append(path_data.prepare(curve, epsilon, moved, phase))
     data = path_data.join(parts)
-    x = path_nlp.pack(nlp, made.profile, units, made.margin, iterate.data.grid.sizes)
-    p = path_nlp.parameters(nlp, data, units, task.options.time_weight)
-    bounds = path_nlp.make_bounds(nlp, data, units, iterate.tightening)
+    x = path_plan.pack(nlp, made.profile, units, made.margin, iterate.data.grid.sizes)
+    p = path_plan.parameters(nlp, data, units, task.options.time_weight)
+    bounds = path_plan.make_bounds(nlp, data, units, iterate.tightening)
     f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
     of_x = _charge(made.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
     of_g = _charge(made.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])

@@ -48,17 +48,19 @@ from .nlp import open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, cut, fit_torque, join
 from .path_domain.path_motion import PathMotion
-from .path_domain.path_nlp import (
+from .path_domain.path_plan import (
     LimitShape,
+    Task,
     Tightening,
     build_path_nlp,
     guess_slowly,
     make_bounds,
     pack,
     parameters,
+    plan_curves,
+    plan_task,
     unpack,
 )
-from .path_domain.path_plan import Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch

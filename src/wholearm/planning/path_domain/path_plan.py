@@ -1,28 +1,52 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-Direct collocation along the curve (`path_nlp`), refined in the loop of `refinement`. Elements end
-where the plan switches from one active limit to another: first where the minimum-time sweep does,
-then where the solution does. They are halved while violations between nodes cost more than the
-accuracy. Limits are tightened by their violations until none exceeds `MISS`; what that costs is the
-estimate of the error.
+Direct collocation along the curve, refined in the loop of `refinement`. Elements end where the plan
+switches from one active limit to another: first where the minimum-time sweep does, then where the
+solution does. They are halved while violations between nodes cost more than the accuracy. Limits
+are tightened by their violations until none exceeds `MISS`; what that costs is the estimate of the
+error.
+
+**NLP.** On a curve z(s) everything is affine in a = s'', b = s'^2 and the internal force lambda,
+but for viscous friction (`PathForces`). Unknowns are a_k, b_k and lambda_k at the nodes s_k of
+elements (`path_motion`). Inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is
+exact,
+
+    b_k+1 = b_k + h sum of links_kj a_j over the nodes j of the element of length h,
+    low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
+    T = sum of h weights_k / sqrt(b_k) (next to rest as in `_find_paces`).
+
+b is continuous where two elements meet; a and lambda may step. Rate-limited torques are continuous:
+d tau / dt = (d tau / dy) (dy / dt) with the local variable y of an element, in which the torques at
+its nodes are a polynomial. The least margin has a copy at every node with m_k+1 = m_k: a dense
+column would make building the Jacobian quadratic in their number. Built once for some contacts,
+intervals and an objective, it serves every phase: grid, coefficients and limits are its parameters
+and bounds.
+
+**First points.** The squared speed b is somewhat below that of the minimum-time speed profile, or a
+parabola in s without one; the internal force is amid its range, and multipliers are those near the
+central path.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, Expression
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
-from ...mechanics.limits import PRESS
+from ...mechanics.dynamics import LAMBDA, ONE, A, B, V, reduced_inertia
+from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
+from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
@@ -38,21 +62,22 @@ from .path_mesh import (
     make_grid,
     match,
 )
-from .path_motion import DEGREE, Elements, PathMotion, Profile, follow
-from .path_nlp import (
-    LimitShape,
-    PathNLP,
-    SureStart,
-    Tightening,
-    Units,
-    build_path_nlp,
-    center,
-    guess,
-    guess_below,
-    make_bounds,
-    pack,
-    parameters,
-    unpack,
+from .path_motion import (
+    DEGREE,
+    FROM_HOLD,
+    FROM_REST,
+    INSIDE,
+    NODES,
+    POWERS,
+    SIGNS,
+    TO_HOLD,
+    TO_REST,
+    Elements,
+    Grid,
+    PathMotion,
+    Profile,
+    find_basis,
+    follow,
 )
 
 if TYPE_CHECKING:
@@ -64,7 +89,8 @@ MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relat
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
-WORTH = 0.02  # largest relative cost of such a start
+WORTH = 0.02  # largest relative cost of a start without friction at rest (`SureStart`)
+LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
 def plan_curves(
@@ -590,3 +616,517 @@ class PathIterate:
         """Value of the plans' objective, the margin's with the opposite sign."""
         values = [plan.value for plan in self.plans]
         return -values[0] if self.task.options.goal is Objective.MARGIN else sum(values)
+
+
+class LimitShape(NamedTuple):
+    """Structure of the limits that an NLP is built for."""
+
+    rows: int  # number m of rows
+    sides: tuple[tuple[int, float], ...]  # row and sign of each, in the order of `LimitSet.sides`
+    presses: tuple[int, ...]  # rows of the least normal forces
+    torques: tuple[int, ...]  # rows of the torques
+    fast: tuple[int, ...]  # rows that depend on s'
+    rates: tuple[int, ...]  # joints with a torque rate limit
+    commands: tuple[int, ...]  # joints whose torques lag behind a command
+
+    @staticmethod
+    def of(data: PhaseData) -> LimitShape:
+        """The shape of the limits of phases and of their motors."""
+        limits, scene = data.limits, data.curve.formation.scene
+        rows, signs, _ = limits.sides
+        of_tau, of_rates = (part.any(axis=1) for part in limits.columns[1:])
+        drags = np.array([limits.limits[k].drags for k in limits.owners])
+        return LimitShape(
+            len(limits.low),
+            tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
+            tuple(limits.of(PRESS).tolist()),
+            tuple(limits.of(TORQUE).tolist()),
+            tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
+            tuple(np.flatnonzero(np.isfinite(scene.torque_rate_limit)).tolist()),
+            tuple(np.flatnonzero(scene.actuator_lag).tolist()),
+        )
+
+    @property
+    def slow(self) -> tuple[int, ...]:
+        """Joints whose torques may not step."""
+        return tuple(sorted({*self.rates, *self.commands}))
+
+
+def _find_lengths(h: Expression) -> Expression:
+    """Length of each element, shape (1, E)."""
+    return ca.sum1(ca.reshape(ca.vertcat(h, 0), NODES, -1))
+
+
+def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expression:
+    """Rise of b from each node to the next, shape (N,); with `bends` under rate limits."""
+    table, lengths = ca.reshape(a, NODES, -1), _find_lengths(h)
+    count = lengths.numel()
+    links, kinds = find_basis().links, list_kinds(count, bends is not None)
+    rises = ca.horzcat(*(ca.DM(links[kind]) @ table[:, k] for k, kind in enumerate(kinds)))
+    if bends is not None:
+        inner = ca.DM(links[FROM_REST] - links[INSIDE]) @ table[:, 1:-1]
+        rises[:, 1:-1] += inner * ca.repmat(bends[1:-1], DEGREE, 1)
+    rises = rises * ca.repmat(lengths, DEGREE, 1)
+    return ca.vec(ca.vertcat(rises, ca.SX(1, count)))[:-1]
+
+
+def _find_paces(
+    a: Expression, speed: Expression, h: Expression, bends: Expression | None
+) -> Expression:
+    """Rate dy/dt of the local variable at each node, times the element's length, (p + 1, E)."""
+    basis, held = find_basis(), bends is not None
+    lengths = _find_lengths(h)
+    count = lengths.numel()
+    paces = ca.reshape(speed, NODES, -1)
+    if bends is not None:
+        c = ca.repmat(bends[1:-1], NODES, 1)
+        paces[:, 1:-1] /= 1 - c + 2 * c * ca.repmat(ca.DM(basis.y[INSIDE]), 1, count - 2)
+    slopes = find_first_slopes(a) if held else (a[0], a[-1])
+    # Next to rest the speed is a power of the local variable times a smooth factor.
+    for e, kind in ((0, list_kinds(count, held)[0]), (count - 1, list_kinds(count, held)[-1])):
+        rest, power = 0 if SIGNS[kind] > 0 else DEGREE, int(POWERS[kind])
+        for j, y in enumerate(basis.y[kind].tolist()):
+            growth = SIGNS[kind] * slopes[0 if e == 0 else 1]
+            start = ca.sqrt((1.5 if held else 2) * lengths[e] * growth)
+            paces[j, e] = (start if j == rest else paces[j, e] / y ** (power - 1)) / power
+    return paces
+
+
+def _find_bends(values: Expression, degree: int) -> Expression:
+    """Sum of the squared Legendre coefficients of each element from a degree on, shape (1, E)."""
+    return ca.sum1((ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, NODES, -1)) ** 2)
+
+
+def list_kinds(count: int, held: bool) -> list[int]:
+    """Kinds of `count` elements from rest to rest."""
+    start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
+    return [start, *[INSIDE] * (count - 2), stop]
+
+
+def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
+    """Slopes of s'' over y at the start, and at the end backwards."""
+    basis = find_basis()
+    start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:NODES]
+    return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-NODES:]
+
+
+def list_slopes() -> list[Array]:
+    """Differentiation matrices at the nodes of each kind of element, over y in forward time."""
+    basis, powers = find_basis(), np.arange(NODES)
+    return [
+        sign * (powers * y[:, None] ** np.maximum(powers - 1, 0)) @ to_powers
+        for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True)
+    ]
+
+
+class Units(NamedTuple):
+    """Units of the NLP, in which its numbers are near 1 whatever the scene's size and mass are."""
+
+    length: float  # [m]
+    time: float  # [s]
+    force: float  # [N]
+    torque: Array  # (2,) [N m]: of each joint
+    power: float  # [(N m)^2]: of the effort's integrand
+    press: float  # [N]: typical internal force, in the regularization
+
+    @property
+    def profile(self) -> Array:
+        """Units of (b, a, internal force), shape (3,)."""
+        speed = self.length / self.time
+        return np.array([speed**2, speed / self.time, self.force])
+
+    def of(self, limits: LimitSet) -> Array:
+        """Units of each row of limits, shape (m,)."""
+        of_torque = np.abs(limits.columns[1])
+        return np.where(of_torque.any(axis=1), of_torque @ self.torque, self.force)
+
+
+class SureStart(NamedTuple):
+    """Bounds of the first node: s'' from `least_a` up, internal force from `low` to `high`."""
+
+    least_a: float
+    low: float
+    high: float
+
+
+class Tightening(NamedTuple):
+    """Tightening of limits at the nodes so that they hold between nodes too."""
+
+    limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
+    speed_share: Array  # (N + 1,): factor on the largest b
+    duration: float | None  # [s]: longest duration, if there is one
+    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
+    motors: Array  # (N + 1, 2, 2): factors on torque rate limits and on the largest commands
+
+    @staticmethod
+    def none(data: PhaseData, duration: float | None) -> Tightening:
+        """Limits as they are."""
+        count = len(data.grid.s)
+        limits = np.zeros((count, len(data.spans)))
+        return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class PathNLP:
+    """A built NLP."""
+
+    # both take x0, p, bounds and multipliers; see `build_path_nlp` for their order
+    solver: Expression
+    starter: Expression  # for points that are no solution, with slacks near the central path
+    shape: LimitShape
+    intervals: int
+    objective: Objective
+    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
+    # shortfalls for `elastic`, or the least margin
+    node: Columns
+    # `steps`, `weight` of time, unit of internal force in the regularization;
+    # coefficients of the limits at the nodes, column by column (the constant ones are part of the
+    # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, bends of
+    # elements and `sizes` of b for rate limits
+    p: Columns
+    # b' = 2 a; the `chain` of the margin; node by node the `limits`, side by side where they are
+    # soft; the `duration` for `margin`; rate limits
+    g: Columns
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
+        mask = np.ones((self.intervals + 1, self.node.count), dtype=bool)
+        mask[[0, -1], self.node["b"]] = False
+        return mask
+
+
+@lru_cache(maxsize=16)
+def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> PathNLP:
+    """Build the NLP for every phase with limits of a shape."""
+    started = time.perf_counter()
+    n, m, slow = intervals + 1, shape.rows, shape.slow
+    effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
+    soft = objective is Objective.ELASTIC
+    sizes = {"steps": intervals, "weight": 1, "calm": 1}
+    sizes |= {"a": n * m, "b": n * m, "lam": n * m, "speed": n * len(shape.fast)}
+    if effort or slow:
+        sizes |= {"torque": n * 2}
+    if effort:
+        sizes |= {"joints": 2}
+    if slow:
+        sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
+        sizes |= {"bends": n // NODES, "sizes": n}
+    p = Columns(**sizes)
+    symbols = p.make_symbols()
+    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
+    extra = ca.SX.sym("extra", n, m if soft else int(late))
+    h, fast = symbols.steps, list(shape.fast)
+    # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
+    bends, scales = (symbols.bends.T, symbols.sizes) if slow else (None, ca.DM.ones(n))
+    b = ca.vertcat(0, b_inner * scales[1:-1], 0)
+    speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
+    largest = ca.fmax(scales[1:], scales[:-1])
+    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
+    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
+
+    def scale(name: str, column: Expression) -> Expression:
+        table = ca.reshape(getattr(symbols, name), n, -1)
+        return table * ca.repmat(column, 1, table.shape[1])
+
+    # Limits but for their constant part, which is in the bounds.
+    values = scale("a", a) + scale("b", b) + scale("lam", lam)
+    values[:, fast] += scale("speed", speed)
+    torques = values[:, list(shape.torques)]
+    if effort or slow:
+        torques += ca.reshape(symbols.torque, n, 2)
+    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
+    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
+    if soft:
+        # Soft limits would otherwise be avoided by motions that reverse between nodes.
+        first, second = _find_bends(a, 1), _find_bends(a, 2)
+        rough += 1e3 * ca.horzcat(first[0], second[1:-1], first[-1])
+        node_costs[:-1] += 1e-4 * (a[1:] - a[:-1]) ** 2
+    node_costs[0] += 0.1 * ca.sum2(lengths * rough)  # no oscillation within elements
+    if objective is Objective.TIME:
+        node_costs += times
+    elif effort:
+        node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
+    elif late:
+        node_costs[0] -= extra[0]
+    else:
+        # Not weighted by lengths, or shortfalls at short intervals would be cheap.
+        node_costs += ca.sum2(extra) / n + 1e-4 * times
+
+    # Limits at the nodes, side by side where they are soft.
+    limits = values
+    if late:
+        limits = values - extra @ ca.DM(np.isin(np.arange(m), shape.presses).astype(float)).T
+    elif soft:
+        sides = [values[:, row] + sign * extra[:, row] for row, sign in shape.sides]
+        limits = ca.horzcat(*sides)
+    none = ca.SX(0, 1)
+    rows = {
+        "links": (b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
+        "chain": extra[1:] - extra[:-1] if late else none,
+        "limits": ca.vec(limits.T),
+        "duration": ca.sum1(times) if late else none,
+    }
+    rates, kinds = dict[int, Expression](), list_kinds(n // NODES, True)
+    for joint in slow:
+        # The derivative of the polynomials of y through the torques at the nodes.
+        table = ca.reshape(torques[:, joint], NODES, -1)
+        parts = [ca.DM(list_slopes()[kind]) @ table[:, e] for e, kind in enumerate(kinds)]
+        rates[joint] = ca.vec(ca.horzcat(*parts) * paces / ca.repmat(lengths, NODES, 1))
+    quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(shape.commands)]
+    joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
+    motor_rows = {"rates": quick, "commands": lagged, "joins": joins}
+    rows |= {name: ca.vertcat(none, *expressions) for name, expressions in motor_rows.items()}
+    rows["begins"] = ca.vertcat(*find_first_slopes(a)) if slow else none
+    g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
+    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
+    nlp = {
+        "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
+        "p": symbols.every,
+        "f": ca.sum1(node_costs),
+        "g": g.write(**rows),
+    }
+    book(SolverStatistics(build_time=time.perf_counter() - started))
+    # Soft NLPs start far from their optimum, and need the more robust strategy.
+    strategy: dict[str, Any]
+    strategy = {"mu_strategy": "monotone"} if soft else {"mu_oracle": "probing"}
+    if slow:
+        # Large gradients of the time next to rest would scale the objective down. Probing lowers
+        # the barrier at once, and steps along the bounds of rates are short then.
+        strategy = {"nlp_scaling_method": "none", "mu_oracle": "quality-function"}
+    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    starter = solver
+    if slow:
+        derived = {"jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l", "grad_f": "nlp_grad_f"}
+        same = {key: solver.function.get_function(name) for key, name in derived.items()}
+        starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
+    node = Columns(b=1, a=1, lam=1, extra=extra.shape[1])
+    return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
+
+
+def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) -> Array:
+    """Parameters of the NLP, in its units."""
+    terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
+    blocks = {
+        "a": terms[..., A] * a_unit / unit,
+        "b": terms[..., B] * b_unit / unit,
+        "lam": terms[..., LAMBDA] * force / unit,
+        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
+    }
+    torque, shape = unit[list(nlp.shape.torques)], nlp.shape
+    if nlp.objective is Objective.EFFORT or shape.slow:
+        blocks["torque"] = data.nodes.forces.of_tau[..., ONE] / torque
+    if nlp.objective is Objective.EFFORT:
+        blocks["joints"] = torque**2 / units.power
+    if shape.slow:
+        scene, rates, commands = data.curve.formation.scene, list(shape.rates), list(shape.commands)
+        blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
+        blocks["lags"] = scene.actuator_lag[commands] / units.time
+        blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
+    return np.asarray(
+        nlp.p.join(
+            steps=data.grid.steps / units.length,
+            weight=[time_weight / units.power],
+            calm=[force / units.press],
+            **{name: block.ravel("F") for name, block in blocks.items()},
+        )
+    )
+
+
+def make_bounds(
+    nlp: PathNLP,
+    data: PhaseData,
+    units: Units,
+    tightening: Tightening,
+    start: SureStart | None = None,
+    pins: tuple[float | None, float | None] = (None, None),
+) -> dict[str, Array]:
+    """Bounds of the NLP, with every limit tightened."""
+    tight, speed_share, duration, *_ = tightening
+    n, node = len(data.grid.s), nlp.node
+    low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
+    b_max = data.largest_b(data.nodes)
+    # Next to rest b is 2 s times the least s''.
+    s, length = data.grid.s, data.grid.s[-1]
+    low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
+    high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    if data.grid.held:
+        low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
+    # From rest to rest, without reversal.
+    if nlp.shape.slow:
+        low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+    else:
+        low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+    if start is not None:
+        _, a_unit, force = units.profile
+        low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
+        low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
+    for place, pin in zip((0, -1), pins, strict=True):
+        if pin is not None:
+            low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
+    low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+    rows, signs, bounds = data.limits.sides
+    sides = bounds + signs * tight - data.find_terms()[:, rows, ONE]
+    sides /= units.of(data.limits)[rows]
+    side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
+    width = nlp.g.sizes["limits"] // n
+    rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
+    rows_low[:, side[signs > 0]] = sides[:, signs > 0]
+    rows_high[:, side[signs < 0]] = sides[:, signs < 0]
+    late = nlp.g.sizes["duration"]
+    equal = np.zeros(nlp.g["limits"].start)
+    longest = np.full(late, (duration or np.inf) / units.time)
+    rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
+    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
+    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+    motors_low = -within, joins, begins, -np.inf * begins
+    motors_high = within, joins, np.inf * begins, -begins
+    return {
+        "lbx": low[nlp.free],
+        "ubx": high[nlp.free],
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
+    }
+
+
+def pack(
+    nlp: PathNLP, profile: Profile, units: Units, extra: float | Array, sizes: Array | float = 1.0
+) -> Array:
+    """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
+
+    `extra` is the least margin [N], or shortfalls in the units of the limits.
+    """
+    table = np.empty(nlp.free.shape)
+    unit = units.force if nlp.objective is Objective.MARGIN else 1.0
+    table[:, nlp.node["extra"]] = extra / unit
+    table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
+    table[:, 0] /= sizes
+    return np.asarray(table[nlp.free])
+
+
+def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
+    """Profile of a solution, and the least margin [N], if any.
+
+    b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
+    """
+    table = np.zeros(nlp.free.shape)
+    table[nlp.free] = x
+    a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
+    margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
+    return follow(grid, a, lam), margin
+
+
+_SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
+_BELOW = 0.9  # squared speed of a guess over that of the minimum-time profile: strictly feasible
+# Complementarity of multipliers near the central path, and least slack, in units of the NLP.
+_CENTRAL, _SLACK = 1e-4, 1e-3
+
+
+def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
+    """A guess with b as high as limits allow, by bisection.
+
+    Where limits forbid even the slowest one, it is as quick as a fall: in units of a slow one the
+    regularization would weigh too much.
+    """
+    limits, fall = data.find_limits(data.nodes), _fall(data)
+
+    def possible(height: float) -> bool:
+        a, b = _parabola(data, height)
+        low, high = limits.find_internal_force_range(a, b)
+        return bool(((low <= high) & (low < np.inf) & (b <= limits.cap)).all())
+
+    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
+    low_power, high_power = float(_SLOW), 8.0
+    for _ in range(7):
+        power = (low_power + high_power) / 2
+        if possible(fall * 2**power):
+            low_power = power
+        else:
+            high_power = power
+    none = low_power == _SLOW
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
+
+
+def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
+    """A slow guess, whatever the limits."""
+    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+
+
+def _fall(data: PhaseData) -> float:
+    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
+    length, forces = float(data.grid.s[-1]), data.nodes.forces
+    fall = 2 * data.curve.formation.scene.scales.acceleration * length
+
+    def usual(coefficients: Array) -> float:
+        """Value at which this coefficient alone takes a joint to its torque limit."""
+        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
+
+    # The upper median; NumPy's takes 10 ms to import what it needs.
+    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
+    median = float(np.partition(b_max, middle)[middle])
+    inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
+    # Above what torques alone allow; case: joints with strong drag.
+    return min(fall, 30.0 * min(inertia, drag, median))
+
+
+def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """The a and b of a parabola in s of this height; its power 4/3 where a starts at zero."""
+    length = data.grid.s[-1]
+    x = data.grid.s / length
+    if data.grid.held:
+        arch = np.maximum(4 * x * (1 - x), 0.0)
+        slope = 8 / 3 * (1 - 2 * x) / length
+        return height * slope * np.cbrt(arch), height * arch * np.cbrt(arch)
+    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
+
+
+def guess_below(data: PhaseData, fastest: Fastest) -> Profile:
+    """A guess somewhat slower than the minimum-time profile."""
+    a, b = (_BELOW * np.interp(data.grid.s, *pair) for pair in (fastest.slopes, fastest[:2]))
+    return _complete(data, a, b)[0]
+
+
+def _complete(data: PhaseData, a: Array, b: Array) -> tuple[Profile, Array]:
+    """A motion with the internal force amid a part of its range, and the one amid all of it.
+
+    Both are zero without a range.
+    """
+    low, high = data.find_limits(data.nodes).find_internal_force_range(a, b)
+    force = data.curve.formation.scene.scales.force
+    near = np.minimum(high, low + 40.0 * np.maximum(force, np.abs(low)))
+    finite = np.isfinite(low + high) & (low <= high)
+    part, whole = (np.where(finite, (low + end) / 2, 0.0) for end in (near, high))
+    return Profile(a, b, part), whole
+
+
+def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
+    profile, whole = _complete(data, *_parabola(data, height))
+    length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
+    duration, torque = np.pi / 2 * length / np.sqrt(height), data.torque_limit
+    force = max(0.5 * weight, data.epsilon, float(np.abs(profile.lam).mean()))  # the least unit
+    squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
+    power = time_weight + float(squares.sum(axis=1).mean())
+    most = max(force, float(np.abs(whole).mean()))
+    return profile, Units(length, 0.6 * duration, force, torque, power, most)
+
+
+def center(
+    nlp: PathNLP, data: PhaseData, units: Units, profile: Profile, margin: float
+) -> dict[str, Array]:
+    """Multipliers with which a motion is near the central path: none of the links b' = 2 a."""
+    (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
+    slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
+    on_rows = np.zeros((len(slack), nlp.shape.rows))
+    for side, row in enumerate(rows.tolist()):
+        on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
+    on_x = np.zeros(nlp.free.shape)
+    on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
+    # The chain's multiplier at a node is the sum of those of normal forces from there on.
+    chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
+    multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
+    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
+    return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
