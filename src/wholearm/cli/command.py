@@ -177,6 +177,8 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     friction and torques take away (2.5); 0 is as fast as the plan in 0.0..1e3
 --period          of the control loop [s] = 1e-3 in 1e-5..10
 --delay           time from measuring to when torques take effect [s] = 5e-4 in 0.0..10
+--dwell           time at rest before the next phase begins, for contacts to close [s] = 0.025 in
+    0.0..10
 --torque-limit    of both fingers, if more than the plan's [N m] (the same) in 1e-12..1e12
 --largest         also look for how many times as wide ranges a policy can keep contacts in
 --departure       how far contacts may open in its simulation, over the object's radius of gyration
@@ -880,19 +882,20 @@ def _policy(options: argparse.Namespace) -> int:
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    values = list_given(options, "reserve", "period", "delay", "torque_limit")
+    values = list_given(options, "reserve", "period", "delay", "dwell", "torque_limit")
     allowed, say = list_given(options, "departure"), show_progress()
 
     def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
         return wholearm.solve(own, replay=False, progress=say).trajectory
 
     def advise() -> str:
-        """Which of a faster loop, half the reserve, and more force in the plan would do."""
-        period, epsilon = min(2e-4, options.period), 2 * problem.epsilon
+        """Which of longer dwells, a faster loop, half the reserve, and more force would do."""
+        period, epsilon, dwell = min(2e-4, options.period), 2 * problem.epsilon, 4 * options.dwell
         usual = 2.5 if problem.uncertainty is None else 1.0
         reserve = (usual if options.reserve is None else options.reserve) / 2
         firm = problem.with_({"epsilon": epsilon})
         trials: list[tuple[str, wholearm.Problem, dict[str, Any]]] = [
+            (f"--dwell {dwell:g}", problem, {"dwell": dwell}),
             (f"--period {period:g} --delay 0", problem, {"period": period, "delay": 0.0}),
             (f"--reserve {reserve:g}", problem, {"reserve": reserve}),
             (f"a plan with epsilon = {epsilon:g} N", firm, {}),

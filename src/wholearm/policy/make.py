@@ -65,9 +65,6 @@ class ReferenceSettings:
     near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
     arrival: float = 6e-3  # time constant of the approach to the end [s]
-    # Time at rest before the next phase begins [s]: contacts that errors open on arrival close
-    # meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
-    dwell: float = 25e-3
     # Squared speeds over the plan's, tried until there is the margin: relative errors of torques
     # matter less where torques are small. Cases: square, phase 2; hexagon, phase 8; two flips,
     # phases 8 and 9.
@@ -84,6 +81,9 @@ class ReferenceSettings:
 
 
 SETTINGS = ReferenceSettings()
+# Time at rest before the next phase begins [s]: contacts that errors open on arrival close
+# meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
+DWELL = 25e-3
 UNLIMITED = np.array([1e9, 0.0, 0.0, 0.0, 0.0])
 FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 """Columns that torques do not change: all but those of s'' and the internal force."""
@@ -654,6 +654,7 @@ def make_policy(
     reserve: float | None = None,
     period: float = 1e-3,
     delay: float = 5e-4,
+    dwell: float = DWELL,
     torque_limit: float | None = None,
     planner: Planner | None = None,
 ) -> Policy:
@@ -667,6 +668,7 @@ def make_policy(
                           (2.5). Where the plan leaves less, the motion is slower; 0: as the plan
     period : [s]          of the control loop
     delay : [s]           from measuring to applying torques, as far as known
+    dwell : [s]           at rest before the next phase begins
     torque_limit : [N m]  of both fingers, if the plan was made with less than the hand has
     planner               replans phases with more degrees of freedom that leave no margin, unless
                           `reserve` is 0
@@ -679,6 +681,7 @@ def make_policy(
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
+    dwell = require_number(dwell, "dwell", nonnegative=True)
     if len(plan.phase_starts) != len(problem.phases) + 1:
         text = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
         raise InputError("", "phases of the plan", text)
@@ -690,7 +693,7 @@ def make_policy(
         delay=delay,
         touch=SETTINGS.touch * scales.speed,
         still=STILL * scales.speed,
-        dwell=SETTINGS.dwell,
+        dwell=dwell,
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
