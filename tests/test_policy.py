@@ -24,6 +24,7 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
+from wholearm.policy import regulator
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.make import (
     SETTINGS,
@@ -34,15 +35,7 @@ from wholearm.policy.make import (
     retime,
     retime_within,
 )
-from wholearm.policy.regulator import (
-    DAMPING,
-    RATE,
-    SAME,
-    Linear,
-    hold_end,
-    regulate,
-    tabulate_motion,
-)
+from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
 from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
 from wholearm.results.dwell_record import assemble
@@ -144,6 +137,13 @@ def test_without_a_reserve_it_is_as_fast_as_the_plan(
     for phase, with_reserve in zip(own, policy.about["phases"], strict=True):
         assert phase["plan"] <= phase["duration"] < with_reserve["duration"]
         assert with_reserve["duration"] < 1.5 * phase["plan"]
+
+
+def test_a_longer_dwell_counts_at_every_stop(problem: Problem, plan: Plan, policy: Policy) -> None:
+    longer = make_policy(problem, plan.trajectory, dwell=policy.settings.dwell + 0.01)
+    stops = 0.01 * sum(not law.passes for law in policy.laws)
+    assert longer.duration - policy.duration == pytest.approx(stops, abs=1e-9)
+    assert verify_policy(problem, plan, longer).ok
 
 
 def test_a_policy_keeps_contacts_where_numbers_are_off(
@@ -403,7 +403,7 @@ def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:
     assert np.abs(plan.tau).max() == pytest.approx(2.0, rel=1e-6)
     assert np.abs(law.tau).max() < 1.85
     # It ends where the plan does: the new landing is pinned to the plan's.
-    assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=SAME)
+    assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=regulator.SAME)
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
 
