@@ -368,11 +368,11 @@ def _list_motors(scene: Scene) -> list[tuple[str, float]]:
 
 
 def refuse_motors(
-    scene: Scene, quick: Scene | None, phases: Sequence[int], reason: str = ""
+    scene: Scene, quick: Scene | None, phases: Sequence[int], reason: str = "", tried: str = ""
 ) -> InfeasibleError:
     """The error for phases without a plan with the torques that motors or control periods allow.
 
-    There is a plan in the scene `quick`; None if only with free torques.
+    There is a plan in the scene `quick`; None if only with free torques, and none as `tried`.
     """
     changes = dict[Change, None]()
     pairs = zip(_list_motors(scene), _list_motors(quick or scene), strict=True)
@@ -383,7 +383,8 @@ def refuse_motors(
             changes[change] = None
     text = f"{name_phases(phases, 'infeasible')}: torques may not change as quickly as they would "
     advice = f"feasible with {' and '.join(map(str, changes))}"
-    text += f"have to; {advice if changes else 'a plan was found with free torques'}"
+    free = f"a plan was found with free torques{tried and f', and none with {tried}'}"
+    text += f"have to; {advice if changes else free}"
     text += f"; {reason}" * bool(reason)
     return InfeasibleError(text, changes=changes if len(changes) == 1 else ())
 
