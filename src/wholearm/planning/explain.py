@@ -383,7 +383,7 @@ def refuse_motors(
             changes[change] = None
     text = f"{name_phases(phases, 'infeasible')}: torques may not change as quickly as they would "
     advice = f"feasible with {' and '.join(map(str, changes))}"
-    free = f"a plan was found with free torques{tried and f', and none with {tried}'}"
+    free = "a plan was found with free torques" + f", and none with {tried}" * bool(tried)
     text += f"have to; {advice if changes else free}"
     text += f"; {reason}" * bool(reason)
     return InfeasibleError(text, changes=changes if len(changes) == 1 else ())

@@ -28,7 +28,7 @@ from ..problem.read import require_phases
 from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory
-from ..verification.verdict import STILL, find_uniqueness_margin, find_wedged
+from ..verification.verdict import EXACT_REST, find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .nlp import Ledger, charge, open_ledger
@@ -260,7 +260,7 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
             place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
             text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        uniqueness.append((margin, find_wedged(problem, phase, trajectory, rows, STILL)))
+        uniqueness.append((margin, find_wedged(problem, phase, trajectory, rows, EXACT_REST)))
     return uniqueness
 
 
@@ -293,7 +293,7 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
     held = list[int]()  # phases that friction within the ranges may hold at rest at their start
     for phase, plan in zip(problem.phases, planning.plans, strict=True):
         first = plan.motion.evaluate(np.zeros(1))
-        if measure_speed(problem.scene, first.z_dot[0]) <= STILL * scales.speed:
+        if measure_speed(problem.scene, first.z_dot[0]) <= EXACT_REST * scales.speed:
             holds = list_holds(phase.formation, first.z[0], options.ranges)
             held += [phase.number] * (measure_holds(holds, first.tau[0]) < SURE * scales.torque)
     figures = RangeFigures(dict(options.ranges), nominal, held=tuple(held))

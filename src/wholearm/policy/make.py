@@ -65,6 +65,9 @@ class ReferenceSettings:
     near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
     arrival: float = 6e-3  # time constant of the approach to the end [s]
+    # Time at rest before the next phase begins [s]: contacts that errors open on arrival close
+    # meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
+    dwell: float = 25e-3
     # Squared speeds over the plan's, tried until there is the margin: relative errors of torques
     # matter less where torques are small. Cases: square, phase 2; hexagon, phase 8; two flips,
     # phases 8 and 9.
@@ -81,9 +84,6 @@ class ReferenceSettings:
 
 
 SETTINGS = ReferenceSettings()
-# Time at rest before the next phase begins [s]: contacts that errors open on arrival close
-# meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
-DWELL = 25e-3
 UNLIMITED = np.array([1e9, 0.0, 0.0, 0.0, 0.0])
 FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 """Columns that torques do not change: all but those of s'' and the internal force."""
@@ -654,7 +654,7 @@ def make_policy(
     reserve: float | None = None,
     period: float = 1e-3,
     delay: float = 5e-4,
-    dwell: float = DWELL,
+    dwell: float = SETTINGS.dwell,
     torque_limit: float | None = None,
     planner: Planner | None = None,
 ) -> Policy:

@@ -15,7 +15,6 @@ from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import describe_pose
 from ..mechanics import UNIQUENESS
-from ..mechanics.dynamics import metric_weights
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem, Until
@@ -29,7 +28,7 @@ DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
 STRAY = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
-STILL = 1e-9  # relative speed of rest but for rounding
+EXACT_REST = 1e-9  # speed of rest but for rounding, relative to the scene's speed
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 
@@ -188,17 +187,17 @@ def find_uniqueness_margin(
     `rows` are its rows in the phase.
     """
     formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
-    scene = formation.scene
+    scene, z_dot = formation.scene, motion.z_dot[rows]
     columns = [motion.contacts.index(name) for name in formation.names]
     c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
     slides = np.abs(c_t) >= (1 - 1e-6) * formation.friction * np.abs(c_n)
     # Case: phase 9 of query 44 under rate limits.
-    moves = motion.z_dot[rows] ** 2 @ metric_weights(scene) > (STILL * scene.scales.speed) ** 2
-    counted = ~np.isnan(c_n).any(axis=1) & (moves | slides.all(axis=1))
+    moves = [measure_speed(scene, v) > EXACT_REST * scene.scales.speed for v in z_dot]
+    counted = ~np.isnan(c_n).any(axis=1) & (np.array(moves) | slides.all(axis=1))
     if not counted.any():
         return None
     rows, slides, Xi = rows[counted], slides[counted], -np.sign(c_t * c_n)[counted]
-    kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
+    kinematics = formation.evaluate(motion.z[rows], z_dot[counted])
     margins = []
     for pattern in sorted(set(map(tuple, slides.tolist()))):
         rows_of = np.flatnonzero((slides == pattern).all(axis=1))

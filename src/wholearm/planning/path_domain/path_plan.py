@@ -89,7 +89,7 @@ MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relat
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
-WORTH = 0.02  # largest relative cost of a start without friction at rest (`SureStart`)
+WORTH = 0.02  # largest relative cost of a start that friction cannot hold (`SureStart`)
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
