@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
+from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
@@ -28,6 +29,7 @@ from wholearm.common.errors import InfeasibleError, JammingError, SolverError, W
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, inverse
+from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning import lower_bound
 from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
@@ -554,6 +556,24 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     assert isinstance(edge, Edge) and edge.estimate == pytest.approx(
         look_along([slow], epsilon, 1000), rel=0.2
     )
+
+
+@pytest.mark.parametrize(("lever", "passes"), [(50.0, True), (90.0, False)])
+def test_a_place_narrower_than_the_grid_may_need_more_speed(lever: float, passes: bool) -> None:
+    """Behind the break 2.5 + a - v <= 2 and 0.05 lever - a <= 2: there v is at least 1, or 3."""
+
+    def law(s: Array, later: NDArray[np.bool_]) -> tuple[Array, ...]:
+        there = (later & (s < 0.501))[:, None]
+        return np.tile([1.0, -1.0], (len(s), 1)), there * [50.0, lever], there * [-1.0, 0.0]
+
+    toy = Toy(law, breaks=(0.5,))
+    with toy.in_place():
+        if passes:
+            # The largest speed there, sqrt(2), is that without the place.
+            assert look_along([toy.curve], toy.epsilon, 24) == pytest.approx(math.sqrt(2), rel=0.01)
+        else:
+            with pytest.raises(NoMotionError):
+                look_along([toy.curve], toy.epsilon, 24)
 
 
 def test_torques_follow_a_motion_that_fades() -> None:

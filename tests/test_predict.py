@@ -21,16 +21,7 @@ from rows import each
 from scenes import box, constant, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, box_text, problem_of, text_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
-from wholearm.analysis.slow_speeds import (
-    OWN,
-    PathSamples,
-    Prediction,
-    UnitProfile,
-    find_torques,
-    make_torques,
-    predict,
-    sample_path,
-)
+from wholearm.analysis import slow_speeds
 from wholearm.analysis.tuning import FACTOR, TrialOutcome, split_passages
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -54,23 +45,23 @@ def first_phase() -> Problem:
 
 
 @cache
-def predicted() -> Prediction:
-    return predict(first_phase())
+def predicted() -> slow_speeds.Prediction:
+    return slow_speeds.predict(first_phase())
 
 
 @cache
-def road_of(path: Path, index: int = 0) -> PathSamples:
+def road_of(path: Path, index: int = 0) -> slow_speeds.PathSamples:
     problem = problem_of(path)
-    z, roads = problem.start, list[PathSamples]()
+    z, roads = problem.start, list[slow_speeds.PathSamples]()
     for phase in problem.phases[: index + 1]:
-        road = sample_path(phase, z, problem.phases[phase.index + 1 :])
+        road = slow_speeds.sample_path(phase, z, problem.phases[phase.index + 1 :])
         assert road is not None
         roads.append(road)
         z = road.z[-1]
     return roads[-1]
 
 
-def find_least_by_lp(road: PathSamples, row: int, a: float, b: float) -> float:
+def find_least_by_lp(road: slow_speeds.PathSamples, row: int, a: float, b: float) -> float:
     """The largest epsilon at one place, by a linear programme in forces and torques."""
     formation, scene = road.phase.formation, road.phase.formation.scene
     G = force_rows(formation, road.kinematics, road.directions)[row]
@@ -119,7 +110,7 @@ def test_quasistatic_torques_balance_and_are_the_least() -> None:
     road, still = road_of(HEPTAGON), np.zeros(len(road_of(HEPTAGON).s))
     most = road.force_limits.find_best(still, still).least.min()
     for share in (0.0, 0.5, 1.0):
-        torques = find_torques(road, 0.05, share)
+        torques = slow_speeds.find_torques(road, 0.05, share)
         assert torques is not None
         wanted = 0.05 + share * (most - 0.05)
         assert (torques.c_n.min(axis=1) >= wanted - 1e-9).all()
@@ -133,7 +124,7 @@ def test_quasistatic_torques_balance_and_are_the_least() -> None:
 def replay(speed: float) -> Simulation:
     """The first phase from rest to rest with the best squeeze."""
     road = road_of(HEPTAGON)
-    pace = UnitProfile.between(road, (True, True))
+    pace = slow_speeds.UnitProfile.between(road, (True, True))
     a, b = speed**2 * pace.a, speed**2 * pace.b
     tau = road.forces.tau(a, b, road.force_limits.find_best(a, b).internal_force)
     t = pace.way / speed * np.arccos(1 - 2 * road.s / road.length) / np.pi
@@ -159,7 +150,7 @@ def test_the_replay_holds_below_the_predicted_speed_and_not_above() -> None:
 def test_the_straight_line_keeps_its_contacts_and_newtons_laws() -> None:
     table = {"contacts": ["v1-palm", "v2-finger1", "v5-finger2"], "until": {"phi_deg": -5.0}}
     problem = problem_of(HEPTAGON).with_({"phases": [table]})
-    road = sample_path(problem.phases[0], problem.start, ())
+    road = slow_speeds.sample_path(problem.phases[0], problem.start, ())
     assert road is not None and road.curve is None
     formation, scene = road.phase.formation, problem.scene
     assert np.abs(road.kinematics.C).max() < 1e-12
@@ -181,7 +172,7 @@ def test_the_straight_line_keeps_its_contacts_and_newtons_laws() -> None:
 def test_what_is_left_out_is_named() -> None:
     table = {"contacts": ["v1-palm", "v2-finger1"], "until": {"x": 0.04}}
     problem = problem_of(HEPTAGON).with_({"phases": [table]})
-    text = predict(problem).to_text()
+    text = slow_speeds.predict(problem).to_text()
     assert "left out" in text and "has not one or two freedoms" in text
 
 
@@ -195,16 +186,16 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     speed = phase["survivals"][1]["speed"]
     assert phase["is_kept"] and speed == pytest.approx(own.survivals[1].speed)
     assert "<svg" in figure.read_text(encoding="utf-8")
-    assert make_torques(predicted(), 0.05).duration == pytest.approx(own.length / 0.05)
+    assert slow_speeds.make_torques(predicted(), 0.05).duration == pytest.approx(own.length / 0.05)
     assert table.read_text(encoding="utf-8").startswith("t,tau1,tau2\n")
     printed = predicted().to_text()
     for survival in own.survivals:
         assert f"{survival.motion}" in printed and survival.first.name in printed
-    assert OWN in printed and "all along" in printed
+    assert slow_speeds.OWN in printed and "all along" in printed
     assert main(["predict", str(file), "--squeeze", "2"]) == 2
     assert main(["predict", str(file), "--speed", "1"]) == 2
     with pytest.raises(InputError, match="squeeze"):
-        predict(first_phase(), squeeze=math.nan)
+        slow_speeds.predict(first_phase(), squeeze=math.nan)
 
 
 def test_without_quasistatic_torques_the_table_is_printed(

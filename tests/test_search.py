@@ -45,17 +45,9 @@ from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
-from wholearm.search import cuts
+from wholearm.search import cuts, edge_plans
 from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
 from wholearm.search.astar import Route as SearchRoute
-from wholearm.search.edge_plans import (
-    CoarsePlan,
-    Lost,
-    PartPlan,
-    list_printed,
-    plan_part,
-    split_route,
-)
 from wholearm.search.edges import Edge
 from wholearm.search.find_route import find_route, format_phases, load_roadmap, store_roadmap
 from wholearm.search.places import make_place, require_reach
@@ -209,7 +201,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     plan = solved(LANDING)
     motions = (own if isinstance(own, TimeMotion) else None for own in plan.trajectory.motions)
     pairs = zip(plan.problem.phases, motions, strict=True)
-    phases = list_printed(plan.problem.scene, pairs, guesses=True)
+    phases = edge_plans.list_printed(plan.problem.scene, pairs, guesses=True)
     printed = replace(plan.problem, phases=phases)
     again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
     over_time = [phase.number for phase in plan.phases if phase.modes]
@@ -273,17 +265,20 @@ OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
     problem, (_, route) = problem_of(HEPTAGON), to_edge_6()
-    parts = split_route(route.edges)
+    parts = edge_plans.split_route(route.edges)
     assert tuple(edge for part in parts for edge in part) == route.edges
     assert len(parts) > 1 and not any(part[-1].in_cell for part in parts[:-1])
 
-    def plan(part: list[Edge]) -> PartPlan | Lost:
+    def plan(part: list[Edge]) -> edge_plans.PartPlan | edge_plans.Lost:
         begin = replace(problem, start=part[0].start.z)
-        return plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
+        return edge_plans.plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
 
     tasks = [partial(plan, part) for part in parts]
     for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
-        assert isinstance(one, PartPlan) and isinstance(other, PartPlan), (one, other)
+        assert isinstance(one, edge_plans.PartPlan) and isinstance(other, edge_plans.PartPlan), (
+            one,
+            other,
+        )
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
         assert one.duration == pytest.approx(other.duration, rel=1e-6)
         for (mine, motion), (theirs, again) in zip(one.phases, other.phases, strict=True):
@@ -298,9 +293,9 @@ def test_edges_that_cannot_be_planned_are_named() -> None:
     """With next to no torque the first edge has no plan, on any route."""
     _, route = to_edge_6()
     problem = problem_of(HEPTAGON).with_(torque_limit=0.02)
-    edges = [(edge, None) for edge in split_route(route.edges)[0]]
-    lost = plan_part(problem, edges, OPTIONS, lambda _: None)
-    assert isinstance(lost, Lost) and lost.edges == (route.edges[0],)
+    edges = [(edge, None) for edge in edge_plans.split_route(route.edges)[0]]
+    lost = edge_plans.plan_part(problem, edges, OPTIONS, lambda _: None)
+    assert isinstance(lost, edge_plans.Lost) and lost.edges == (route.edges[0],)
     assert "until" in lost and "phase 1" in lost
 
 
@@ -308,12 +303,12 @@ def test_edges_that_cannot_be_planned_are_named() -> None:
 def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     """Paths through cells take longer away from a best place, and there is none beyond an end."""
 
-    def plan(path: RefinedPath) -> CoarsePlan | None:
+    def plan(path: RefinedPath) -> edge_plans.CoarsePlan | None:
         if path.move is None or path.move < end:
             return None
-        return CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
+        return edge_plans.CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
 
-    found, *others = search_release(plan, CoarsePlan(1 + FINEST * abs(best), (), []))
+    found, *others = search_release(plan, edge_plans.CoarsePlan(1 + FINEST * abs(best), (), []))
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
 
@@ -321,18 +316,18 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
 def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
     """An edge that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
 
-    def plan(path: RefinedPath) -> CoarsePlan | None:
+    def plan(path: RefinedPath) -> edge_plans.CoarsePlan | None:
         if path.move is None:
             return None
         z = np.full((1, 5), float(path.move))
         motion = SimpleNamespace(duration=0.0, evaluate=lambda _: SimpleNamespace(z=z, z_dot=z))
         begun: Any = [SimpleNamespace(motion=motion)]
-        return CoarsePlan(1 + abs(path.move), (), begun)
+        return edge_plans.CoarsePlan(1 + abs(path.move), (), begun)
 
     to_go = CostToGo(heptagon.phases[0], lambda z: 2 * abs(float(z[0]) + 3))
     for cost, duration in ((None, 1), (to_go, 4)):
         start = plan(RefinedPath(0))
-        assert isinstance(start, CoarsePlan)
+        assert isinstance(start, edge_plans.CoarsePlan)
         assert search_release(plan, start, cost)[0].duration == duration
 
 

@@ -24,6 +24,7 @@ from wholearm.geometry.path_guess import list_ends
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights, split_forces
 from wholearm.planning.nlp import Columns, Kernel, NlpRows, build_kernel, build_solver
+from wholearm.planning.time_domain import time_nlp
 from wholearm.planning.time_domain.stage import (
     LimitMisses,
     Scheme,
@@ -31,18 +32,6 @@ from wholearm.planning.time_domain.stage import (
     blend,
     fit_controls,
     make_scheme,
-)
-from wholearm.planning.time_domain.time_nlp import (
-    Target,
-    TimeNLP,
-    build_time_nlp,
-    end_kernel,
-    find_bounds,
-    find_leaving,
-    find_range_end,
-    impact_kernel,
-    pack,
-    point_kernel,
 )
 from wholearm.results.trajectory import Samples
 
@@ -156,7 +145,7 @@ def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) 
         Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
         first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
         x = [z, v, a, forces, tau.ravel(), first]
-        y = call(point_kernel(formation, 3), x, Xi, sigma, shares, np.full(n_c, least))
+        y = call(time_nlp.point_kernel(formation, 3), x, Xi, sigma, shares, np.full(n_c, least))
         gaps, rates, bends, balance, senses = np.split(y, np.cumsum(sizes))
         np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-13)
         expected = constraints(formation, z, v, a)
@@ -179,7 +168,7 @@ def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
     n_c = formation.n_contacts
     z, w, _ = draw(rng)
     first = draw(rng)[0] if formation.rolling else z[:0]
-    y = call(end_kernel(formation), [z, w, first])
+    y = call(time_nlp.end_kernel(formation), [z, w, first])
     assert y.shape == (2 * formation.n_constraints,)
     np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-13)
     rates, _ = constraints(formation, z, w, 0 * w)
@@ -224,20 +213,20 @@ def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
 
 def build_nlp(
     stages: list[Stage], scheme: Scheme, objective: Objective = Objective.TIME, weight: float = 3.0
-) -> TimeNLP:
-    return build_time_nlp(stages, scheme, Target(objective, 0.05, weight), 1)
+) -> time_nlp.TimeNLP:
+    return time_nlp.build_time_nlp(stages, scheme, time_nlp.Target(objective, 0.05, weight), 1)
 
 
-def evaluate_at(nlp: TimeNLP, part: str, x: Array) -> Array:
+def evaluate_at(nlp: time_nlp.TimeNLP, part: str, x: Array) -> Array:
     values: Any = nlp.solver.function.get_function(part)(x, [])
     return np.asarray(values.full()[:, 0])
 
 
-def packed(nlp: TimeNLP, stages: list[Stage], margin: float = 0.0) -> Array:
-    return pack([stage.guess for stage in stages], nlp.layouts, margin)
+def packed(nlp: time_nlp.TimeNLP, stages: list[Stage], margin: float = 0.0) -> Array:
+    return time_nlp.pack([stage.guess for stage in stages], nlp.layouts, margin)
 
 
-def misses(nlp: TimeNLP, x: Array) -> tuple[Array, Array]:
+def misses(nlp: time_nlp.TimeNLP, x: Array) -> tuple[Array, Array]:
     """What equations and inequalities miss; inequalities are negative where they hold."""
     low, high = nlp.rows.bounds
     values = evaluate_at(nlp, "nlp_g", x)
@@ -284,7 +273,9 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     scheme, stage = make_scheme(name, degree), driven(name, degree, 8)
     nlp = build_nlp([stage], scheme)
     x = packed(nlp, [stage])
-    (low_x, high_x), (low, _) = find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
+    (low_x, high_x), (low, _) = time_nlp.find_bounds(
+        nlp, [stage], scheme, [LimitMisses.none(stage)]
+    )
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -299,7 +290,7 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
     wrong = replace(stage, directions=Directions(signs[:4], signs[4:]))
     nlp = build_nlp([wrong], scheme)
     x = packed(nlp, [wrong])
-    (low, high), _ = find_bounds(nlp, [wrong], scheme, [LimitMisses.none(wrong)])
+    (low, high), _ = time_nlp.find_bounds(nlp, [wrong], scheme, [LimitMisses.none(wrong)])
     worst = max(misses(nlp, x)[1].max(), (low - x).max(), (x - high).max())
     assert worst > 0.02
 
@@ -319,7 +310,7 @@ def test_what_is_made_least(objective: Objective) -> None:
 def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build_nlp([stage], scheme, Objective.MARGIN)
-    (low_x, _), (low, _) = find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
+    (low_x, _), (low, _) = time_nlp.find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05
@@ -430,12 +421,12 @@ def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> N
     bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
     still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
     n_p, n_c = after.n_constraints, after.n_contacts
-    assert find_leaving(before, after) == [1]
+    assert time_nlp.find_leaving(before, after) == [1]
     for _ in range(3):
         z, v_after, v_before = draw(rng)
         impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)
         x = [v_after, v_before, z, impulses]
-        y = call(impact_kernel(before, after), x, Xi)
+        y = call(time_nlp.impact_kernel(before, after), x, Xi)
         jump, held, leaving, cones = np.split(y, np.cumsum([5, n_p, 1]))
         p_n, p_t = split_forces(after, impulses, Xi)
         row = Samples(z, v_before, v_after - v_before, np.zeros(2), p_n, p_t)
@@ -471,7 +462,7 @@ def test_a_contact_is_gained_where_the_motion_ends() -> None:
     for ending in list_ends(phase):
         z = close_contacts(ending.formation, start, slip, (), ending.active)
         assert z is not None
-        rows.append(find_range_end(phase.formation, phase.until, z))
+        rows.append(time_nlp.find_range_end(phase.formation, phase.until, z))
         gap = phase.formation.add(phase.until.contact).evaluate(z[None], z[None]).C[0, -1]
         assert abs(gap) < 1e-9
     assert rows == [0, None]
