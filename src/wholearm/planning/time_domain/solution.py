@@ -258,15 +258,12 @@ class TimeSearch:
             on_rows = np.where(high_g > low_g, -size, 0.0)
             multipliers = {"lam_x0": size * bounded, "lam_g0": on_rows}
         price = self.price or Price(np.zeros(5), np.zeros(5))
-        result = solver(
-            x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
-            lbx=low,
-            ubx=high,
-            lbg=low_g,
-            ubg=high_g,
-            p=price.gradient,
-            **multipliers,
-        )
+        x0 = pack([stage.guess for stage in stages], nlp.layouts, margin)
+        bounds = {"lbx": low, "ubx": high, "lbg": low_g, "ubg": high_g}
+        result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
+        if not solver.stats()["success"] and nlp.max_iter > ITERATIONS:
+            solver = nlp.make_solver(1e-2, **MONOTONE)
+            result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
         stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(price.gradient @ price.origin)
@@ -311,6 +308,10 @@ class RefinementSettings:
 
 
 SETTINGS = RefinementSettings()
+ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
+# Options of another solve from what is near a solution, where the adaptive barrier parameter falls
+# too soon. Cases: new polygon 9 over time, phase 3 on 22 intervals; query 10 takes twice the time.
+MONOTONE = {"mu_strategy": "monotone", "mu_init": 1e-2}
 COSTLY = "limits between points cost too much"  # status
 _STEP = 1e-6  # step of z for slopes of gaps, over accelerations of a torque of 1
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -209,11 +209,11 @@ class TimeNLP:
         """Ipopt, to start from a solution."""
         return self.make_solver(1e-6)
 
-    def make_solver(self, push: float) -> Expression:
-        """Ipopt, with this distance of the first point from its bounds."""
+    def make_solver(self, push: float, **options: Any) -> Expression:
+        """Ipopt, with this distance of the first point from its bounds, and other options."""
         nlp, derivatives = self.assembled
         most = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
-        return build_solver("time_nlp", nlp, push, derivatives, **most)
+        return build_solver("time_nlp", nlp, push, derivatives, **most, **options)
 
 
 def build_time_nlp(

@@ -43,7 +43,7 @@ from .mode_search import (
     list_neighbours,
     sign_sequence,
 )
-from .solution import COSTLY, TimeSearch, TimeSolution, keep_within, refine_stages
+from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
 from .stage import (
     Scheme,
     Stage,
@@ -59,7 +59,6 @@ from .time_motion import TimeMotion, make_phase_motions
 if TYPE_CHECKING:
     from ..explain import Replan
 
-ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 
@@ -656,10 +655,16 @@ def plan_with_impacts(
         return with_stops(options, duration)
     # A duration that is too short for stops need not be so without them.
     fast = replace(options, objective=Objective.TIME, duration=None)
-    stopped = with_stops(options if duration is None else fast)
-    blocked = [
-        k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
-    ]
+    stopped, reason, blocked = None, None, list[int]()
+    try:
+        stopped = with_stops(options if duration is None else fast)
+    except (InfeasibleError, SolverError) as error:
+        # No motion may come to rest where one passes at speed: phase 3 of new polygon 22.
+        reason = error
+    else:
+        blocked = [
+            k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
+        ]
     if len(blocked) < len(ends):
         bounds = [0, *blocked, len(block)]
         try:
@@ -667,6 +672,9 @@ def plan_with_impacts(
             return plan_stops(direct, bounds, z, options, duration)
         except (InfeasibleError, SolverError):
             pass
+    if stopped is None:
+        assert reason is not None
+        raise reason
     return stopped if duration is None else with_stops(options, duration)
 
 
