@@ -23,17 +23,7 @@ from rows import each
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
 from wholearm.common.arrays import Array
-from wholearm.contacts.closing import (
-    Numbers,
-    close_finger,
-    close_fingers,
-    contact_table,
-    evaluate_each,
-    first_contact,
-    move,
-    place,
-    place_flush,
-)
+from wholearm.contacts import closing
 from wholearm.contacts.elemental import (
     build_features,
     build_pair,
@@ -137,7 +127,7 @@ def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
         q = np.array([rng.uniform(-0.09, 0.09), rng.uniform(0.0, 0.02) - lowest, phi])
         finger = trial % 2
         try:
-            angle = close_finger(scene, q, finger)
+            angle = closing.close_finger(scene, q, finger)
         except InputError as error:
             assert "too short" in error.problem
             angles = np.linspace(-np.pi, np.pi, 1500)
@@ -151,7 +141,7 @@ def test_closing_starts_from_straight_down(finger: int) -> None:
     """An object outside the hand and below the joint is met before the finger points outwards."""
     scene = make_scene(SQUARE, base=0.05, depth=0.12, length=0.1)
     q = np.array([0.12 if finger == 0 else -0.12, 0.03, 0.0])
-    angle = close_finger(scene, q, finger)
+    angle = closing.close_finger(scene, q, finger)
     assert is_first_touch(scene, q, finger, angle)
     assert abs(angle - (-np.pi / 2 if finger == 0 else 3 * np.pi / 2)) < np.pi / 4
 
@@ -179,7 +169,7 @@ def test_joint_inside_the_object(base: list[float]) -> None:
     scene = make_scene(SQUARE)
     scene = replace(scene, fingers=(replace(scene.fingers[0], base=base), scene.fingers[1]))
     with pytest.raises(InputError, match="inside the object") as caught:
-        close_finger(scene, np.array([0.0, 0.03, 0.0]), 0)
+        closing.close_finger(scene, np.array([0.0, 0.03, 0.0]), 0)
     assert caught.value.key == "fingers.1.base"
 
 
@@ -189,7 +179,7 @@ def test_flush_edge_lies_on_the_palm(seed: int) -> None:
     scene = make_scene(convex_polygon(rng, 6))
     for edge in range(6):
         x = rng.uniform(-1, 1)
-        q = place_flush(scene, edge, x)
+        q = closing.place_flush(scene, edge, x)
         heights = place_corners(scene, q)[:, 1]
         assert q[0] == x and -np.pi < q[2] <= np.pi
         np.testing.assert_allclose(heights[[edge, (edge + 1) % 6]], 0.0, atol=ROUNDING)
@@ -303,9 +293,9 @@ def test_a_joint_right_above_the_object_is_refused() -> None:
     scene = make_scene(flat, base=0.08, depth=0.05)
     for x in (0.0, 0.05):
         with pytest.raises(InputError, match="right above it") as caught:
-            close_finger(scene, np.array([x, 0.01, 0.0]), 0)
+            closing.close_finger(scene, np.array([x, 0.01, 0.0]), 0)
         assert caught.value.key == "fingers.1.base"
-    beside = close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
+    beside = closing.close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
     assert abs(finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12
 
 
@@ -320,7 +310,7 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
     assert np.isfinite(np.array(function(np.ones(5)))).all()
 
 
-def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
+def close(radius: float) -> tuple[Scene, closing.Numbers, Array, Array]:
     """A hand with links that are just long enough: labels, poses, and the hand closed there."""
     scene = make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)
@@ -329,7 +319,7 @@ def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     usable = (labels >= 0).all(axis=1)
     assert usable.mean() > 0.25
     labels, x, phi = labels[usable], x[usable], phi[usable]
-    return scene, labels, np.column_stack([x, phi]), close_fingers(scene, x, phi).z
+    return scene, labels, np.column_stack([x, phi]), closing.close_fingers(scene, x, phi).z
 
 
 @pytest.mark.parametrize(("radius", "kinds"), [(0.01, {0, 1, 2}), (0.0, {0, 1})])
@@ -338,17 +328,17 @@ def test_known_contacts_are_where_closing_fingers_come_to_touch(
 ) -> None:
     scene, labels, poses, z = close(radius)
     for finger in (0, 1):
-        found = (labels[:, 1 + finger] - first_contact(scene, finger)) // 4
+        found = (labels[:, 1 + finger] - closing.first_contact(scene, finger)) // 4
         assert set(found.tolist()) == kinds
     # Joint angles lose digits where a link is stretched towards what it touches.
-    np.testing.assert_allclose(place(scene, labels, poses), z, atol=1e-10)
+    np.testing.assert_allclose(closing.place(scene, labels, poses), z, atol=1e-10)
 
 
 def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     scene, labels, poses, _ = close(0.01)
     ways = np.random.default_rng(4).normal(size=poses.shape) * [0.03, 1.0]
-    (z, z_u, z_uu, _), step = move(scene, labels, poses, ways), 1e-5
-    left, right = (place(scene, labels, poses + side * step * ways) for side in (-1, 1))
+    (z, z_u, z_uu, _), step = closing.move(scene, labels, poses, ways), 1e-5
+    left, right = (closing.place(scene, labels, poses + side * step * ways) for side in (-1, 1))
     # Away from where a link is stretched, where derivatives grow.
     mild = np.abs(z_uu).max(axis=1) < 30
     assert mild.mean() > 0.8
@@ -359,12 +349,12 @@ def test_rates_are_those_of_contacts_that_stay_closed() -> None:
 
 def test_rows_are_those_of_each_formation() -> None:
     scene = problem_of(HEPTAGON).scene
-    table = contact_table(scene)
+    table = closing.contact_table(scene)
     borders = [own for own in chart().borders if own.flush is not None][::30]
     labels = np.array([[table.index(contact) for contact in own.contacts] for own in borders])
     z = np.array([own.z[len(own.z) // 2] for own in borders])
     v = np.random.default_rng(5).normal(size=z.shape)
-    found = evaluate_each(scene, labels, z, v)
+    found = closing.evaluate_each(scene, labels, z, v)
     for k, border in enumerate(borders):
         expected = Formation(scene, border.contacts).evaluate(z[k : k + 1], v[k : k + 1])
         for one, other in zip(found, expected, strict=True):

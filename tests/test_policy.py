@@ -40,7 +40,8 @@ from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.simulation.simulate import simulate_free
-from wholearm.verification.free import find_losses, list_aliases, verify_policy
+from wholearm.verification import free
+from wholearm.verification.free import FreeReport, find_losses, list_aliases, verify_policy
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +140,24 @@ def test_without_a_reserve_it_is_as_fast_as_the_plan(
         assert with_reserve["duration"] < 1.5 * phase["plan"]
 
 
-def test_a_longer_dwell_counts_at_every_stop(problem: Problem, plan: Plan, policy: Policy) -> None:
-    longer = make_policy(problem, plan.trajectory, dwell=policy.settings.dwell + 0.01)
-    stops = 0.01 * sum(not law.passes for law in policy.laws)
-    assert longer.duration - policy.duration == pytest.approx(stops, abs=1e-9)
-    assert verify_policy(problem, plan, longer).ok
+def test_contacts_are_made_more_slowly_where_some_are_lost_otherwise(
+    problem: Problem, plan: Plan, policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At half the speed, after times at rest that are four times as long."""
+    usual = policy.settings
+
+    def verify(problem: Problem, plan: Trajectory, policy: Policy, **options: Any) -> FreeReport:
+        report = verify_policy(problem, plan, policy, **options)
+        lost = ("v1-palm is lost",) if policy.settings.touch == usual.touch else ()
+        return replace(report, failures=(*report.failures, *lost))
+
+    monkeypatch.setattr(free, "verify_policy", verify)
+    slower, report = free.find_policy(problem, plan.trajectory)
+    assert report.ok and report.warnings[-1].endswith("otherwise v1-palm is lost")
+    assert slower.settings.touch == pytest.approx(usual.touch / 2)
+    stops = 3 * usual.dwell * sum(not law.passes for law in policy.laws)
+    assert stops < slower.duration - policy.duration < 1.5 * stops
+    assert not free.find_policy(problem, plan.trajectory, contact_speed=1.0)[1].ok
 
 
 def test_a_policy_keeps_contacts_where_numbers_are_off(
@@ -351,9 +365,9 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     first, last = policy.tables
     weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.settings)
     weak.about = policy.about
-    monkeypatch.setattr("wholearm.make_policy", lambda *_, **__: weak)
+    monkeypatch.setattr(free, "make_policy", lambda *_, **__: weak)
     report = verify_policy(problem, plan.trajectory, weak)
-    monkeypatch.setattr("wholearm.verify_policy", lambda *_, **__: report)
+    monkeypatch.setattr(free, "verify_policy", lambda *_, **__: report)
     output = tmp_path / "policy.npz"
     command = ["policy", str(tmp_path / "plan.npz"), "-o", str(output)]
     assert main(command) == 1

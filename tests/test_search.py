@@ -31,15 +31,8 @@ from wholearm.contacts.closing import place as place_at
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import CostToGo, trace_phase
+from wholearm.mapping import formation_list
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.formation_list import (
-    Route,
-    describe_miss,
-    format_route,
-    list_formations,
-    split_leg,
-    tolerance,
-)
 from wholearm.planning.lower_bound import bound_least_time
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.planning.time_domain.time_motion import TimeMotion
@@ -345,7 +338,7 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
     scene = heptagon.scene
     ends = [np.array([0.02, 0.3]), np.array([-0.08, -0.8])]
     start, stop = ends[::-1] if back else ends
-    parts = split_leg(scene, start, stop)
+    parts = formation_list.split_leg(scene, start, stop)
     assert len(parts) == 7
     np.testing.assert_array_equal(parts[0].start, start)
     np.testing.assert_allclose(parts[-1].stop, stop, atol=1e-12)
@@ -364,10 +357,10 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
 
 
 def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None:
-    near = tolerance(heptagon.scene)
+    near = formation_list.tolerance(heptagon.scene)
     for off in (0.0, 0.9, -0.9):
         ends = [on_border(heptagon, phi) + off * near for phi in (PHI, PHI + 0.15)]
-        (part,) = split_leg(heptagon.scene, *ends)
+        (part,) = formation_list.split_leg(heptagon.scene, *ends)
         assert len(part.contacts) == 4 and part.coordinate == 1
         for place, end in ((part.start, ends[0]), (part.stop, ends[1])):
             np.testing.assert_allclose(place, on_border(heptagon, place[1]), atol=1e-12)
@@ -376,7 +369,7 @@ def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None
 
 def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
     """A leg whose ends are three times the tolerance off a border that bulges by so many times."""
-    near = tolerance(problem.scene)[0]
+    near = formation_list.tolerance(problem.scene)[0]
     for span in np.linspace(0.1, 0.6, 400):
         start, stop = on_border(problem, PHI), on_border(problem, PHI + span)
         away = ((start + stop) / 2 - on_border(problem, PHI + span / 2))[0]
@@ -394,7 +387,7 @@ def test_straight_leg_beside_a_curved_border(
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
     on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
     assert (np.diff(on_finger_2) != 0).sum() == 2
-    parts = split_leg(scene, *leg)
+    parts = formation_list.split_leg(scene, *leg)
     touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
     changes = sum(one != two for one, two in pairwise(touched))
     assert changes == (2 if crosses else 0)
@@ -405,19 +398,21 @@ def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
     phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
     words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
     with pytest.raises(InputError, match=words):
-        split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
+        formation_list.split_leg(
+            heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1])
+        )
 
 
 def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
-    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    scene, near = heptagon.scene, formation_list.tolerance(heptagon.scene)
     aside = np.array([near[0], 0.0])
     start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
-    text = describe_miss(scene, start, stop)
+    text = formation_list.describe_miss(scene, start, stop)
     words = "e6 flush on finger 2", " up to -", "mm in x", "0.5 deg"
     assert all(word in text for word in words)
-    assert describe_miss(scene, start + 10 * aside, stop + 10 * aside) == ""
+    assert formation_list.describe_miss(scene, start + 10 * aside, stop + 10 * aside) == ""
     phi = scene.polygon.flush_angle(0) + 3 * near[1]
-    palm = describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    palm = formation_list.describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
     assert "e0 flush on the palm, is up to -1.5 deg" in palm
 
 
@@ -425,21 +420,21 @@ HEPTAGON_TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 FLAT = -1.984
 
 
-def load_pasted(table: dict[str, Any], route: Route, folder: Path) -> Problem:
+def load_pasted(table: dict[str, Any], route: formation_list.Route, folder: Path) -> Problem:
     """What loading gives when the list replaces what it names in a problem file."""
-    text = format_route(route)
+    text = formation_list.format_route(route)
     kept = {key: value for key, value in table.items() if key not in tomllib.loads(text)}
     path = folder / "pasted.toml"
     path.write_text(write_toml(kept) + text, encoding="utf-8")
     return wholearm.load(str(path))
 
 
-def list_degrees(problem: Problem, *poses: tuple[float, float]) -> Route:
-    return list_formations(problem, *((x, np.radians(phi)) for x, phi in poses))
+def list_degrees(problem: Problem, *poses: tuple[float, float]) -> formation_list.Route:
+    return formation_list.list_formations(problem, *((x, np.radians(phi)) for x, phi in poses))
 
 
 def test_slide_is_listed_as_in_the_problem_file(heptagon: Problem) -> None:
-    text = format_route(list_degrees(heptagon, (0.045, FLAT), (-0.0637, FLAT)))
+    text = formation_list.format_route(list_degrees(heptagon, (0.045, FLAT), (-0.0637, FLAT)))
     assert tomllib.loads(text)["phases"] == HEPTAGON_TABLE["phases"][:3]
     assert "[start]" not in text
     headings = [line.split("#")[1][:5] for line in text.splitlines() if "[[" in line]
@@ -452,7 +447,7 @@ def test_route_along_curved_borders_is_the_whole_plan(
     # Poses as read off the map: to a tenth of a millimetre and of a degree.
     poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)]
     route = list_degrees(heptagon, *poses)
-    assert tomllib.loads(format_route(route))["phases"] == HEPTAGON_TABLE["phases"]
+    assert tomllib.loads(formation_list.format_route(route))["phases"] == HEPTAGON_TABLE["phases"]
     for stretch, curve in zip(route, curves, strict=True):
         # Ends are those of the traced curves, but for the last, which the user gives.
         np.testing.assert_allclose(stretch.start, curve.start[[0, 2]], atol=1e-9)
@@ -471,7 +466,7 @@ def test_turn_back_on_a_border_is_a_phase(heptagon: Problem, tmp_path: Path) -> 
 def test_route_that_starts_elsewhere_brings_its_start(heptagon: Problem, tmp_path: Path) -> None:
     route = list_degrees(heptagon, (-0.05, FLAT + 0.2), (0.03, FLAT))
     assert [str(stretch.until) for stretch in route] == ["v5-finger2", "v2-finger1", "x = 0.03 m"]
-    text = format_route(route)
+    text = formation_list.format_route(route)
     assert tomllib.loads(text)["start"] == {"flush": 0, "x": -0.05}
     assert "takes the place of the problem's own" in text
     assert load_pasted(HEPTAGON_TABLE, route, tmp_path).start[0] == -0.05
@@ -479,7 +474,7 @@ def test_route_that_starts_elsewhere_brings_its_start(heptagon: Problem, tmp_pat
 
 def test_route_that_starts_in_a_cell_is_led_there(heptagon: Problem, tmp_path: Path) -> None:
     route = list_degrees(heptagon, (0.03, -8.0), (0.01, -12.0))
-    assert route.start is None and "from the problem's start" in format_route(route)
+    assert route.start is None and "from the problem's start" in formation_list.format_route(route)
     np.testing.assert_allclose(route[0].start, heptagon.start[[0, 2]], rtol=1e-12)
     assert len(load_pasted(HEPTAGON_TABLE, route, tmp_path).phases) == len(route)
 
@@ -494,7 +489,7 @@ def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
         (r"route: -63\.7 given; allowed are .* m ", (x, phi), (-63.7, phi)),
     ):
         with pytest.raises(InputError, match=words):
-            list_formations(heptagon, *poses)
+            formation_list.list_formations(heptagon, *poses)
 
 
 def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:
@@ -590,7 +585,7 @@ def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> Non
     """Also after a leg that ends in a cell, next to where another contact is gained."""
     square = problem_of(FOLDER / "square.toml")
     turns = [(0.0352104, -0.1879037), (0.0561329, -0.4940113), (0.0813296, -0.6529818)]
-    route = list_formations(square, (0.06, 0.0), (0.007424, 0.0), *turns)
+    route = formation_list.list_formations(square, (0.06, 0.0), (0.007424, 0.0), *turns)
     for before, after in pairwise(route):
         assert {*after.contacts} <= {*before.contacts, before.until.contact}
     # Legs that end in a cell do so where they are said to, to what is printed.

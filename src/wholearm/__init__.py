@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from .search.find_route import Answer, find_route
     from .simulation.events import FreeSimulation, Simulation
     from .simulation.simulate import simulate, simulate_free
-    from .verification.free import FreeReport, verify_free, verify_policy
+    from .verification.free import FreeReport, find_policy, verify_free, verify_policy
     from .verification.verify import verify
 
 __version__ = "0.1.0"
@@ -97,7 +97,7 @@ _NAMES = {
     "simulation.events": "FreeSimulation Simulation",
     "simulation.simulate": "simulate simulate_free",
     "analysis.tuning": "Tuning tune",
-    "verification.free": "FreeReport verify_free verify_policy",
+    "verification.free": "FreeReport find_policy verify_free verify_policy",
     "verification.verify": "verify",
 }
 """Public names by their modules."""
@@ -112,10 +112,10 @@ __all__ = [
     "Simulation", "SimulationError", "SolverError", "Status", "Sweep", "TorqueProfile",
     "Trajectory", "Tuning", "Uncertainty", "Until", "WholearmError", "__version__",
     "assess_robustness", "build_map", "compare", "design_hand", "draw_map", "draw_sweep",
-    "find_route", "find_sensitivities", "format_route", "list_formations", "load",
-    "load_plan", "load_trajectory", "make_policy", "place_start", "play_policy", "plots",
-    "predict", "read_formation", "read_torque_csv", "read_until", "replay_in", "save",
-    "simulate", "simulate_free", "solve", "sweep", "tune", "verify", "verify_free",
+    "find_policy", "find_route", "find_sensitivities", "format_route", "list_formations",
+    "load", "load_plan", "load_trajectory", "make_policy", "place_start", "play_policy",
+    "plots", "predict", "read_formation", "read_torque_csv", "read_until", "replay_in",
+    "save", "simulate", "simulate_free", "solve", "sweep", "tune", "verify", "verify_free",
     "verify_policy", "write_mjcf",
 ]  # fmt: skip
 

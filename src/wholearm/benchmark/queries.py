@@ -31,12 +31,11 @@ from ..common.fields import choice
 from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
-from ..policy.make import make_policy
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
 from ..results.trajectory import Trajectory
 from ..search.find_route import Answer, find_route, forget_roadmaps
-from ..verification.free import verify_policy
+from ..verification.free import find_policy
 from ..verification.verify import verify
 from .study import Case, Findings, Row, Study
 
@@ -157,8 +156,7 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
                 printed = solve(build_problem(table | tomllib.loads(answer.to_text())), objective)
                 part["off"] = printed.value / answer.plan.value - 1
             elif way == "policy":
-                policy = make_policy(printed.problem, printed.trajectory, planner=plan_anew)
-                report = verify_policy(printed.problem, printed.trajectory, policy)
+                report = find_policy(printed.problem, printed.trajectory, planner=plan_anew)[1]
                 part["why"] = "; ".join(report.failures)
             else:
                 changed = printed.problem.with_(changes.get(way, {}))

@@ -177,8 +177,9 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     friction and torques take away (2.5); 0 is as fast as the plan in 0.0..1e3
 --period          of the control loop [s] = 1e-3 in 1e-5..10
 --delay           time from measuring to when torques take effect [s] = 5e-4 in 0.0..10
---dwell           time at rest before the next phase begins, for contacts to close [s] = 0.025 in
-    0.0..10
+--contact-speed   at which contacts are made, over the usual speed; times at rest before the next
+    phase begins are longer by its inverse square (the largest of 1, 0.5 and 0.25 that keeps all
+    contacts in its simulation) in 1e-3..10
 --torque-limit    of both fingers, if more than the plan's [N m] (the same) in 1e-12..1e12
 --largest         also look for how many times as wide ranges a policy can keep contacts in
 --departure       how far contacts may open in its simulation, over the object's radius of gyration
@@ -877,25 +878,27 @@ def _replay(options: argparse.Namespace) -> int:
 def _policy(options: argparse.Namespace) -> int:
     from ..policy.make import find_widest
     from ..problem.read import read_own_problem
+    from ..verification.free import find_policy
 
     output = options.output or f"{Path(options.plan).stem}_policy.npz"
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    values = list_given(options, "reserve", "period", "delay", "dwell", "torque_limit")
-    allowed, say = list_given(options, "departure"), show_progress()
+    say = show_progress()
 
     def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
         return wholearm.solve(own, replay=False, progress=say).trajectory
 
+    names = "reserve", "period", "delay", "torque_limit", "contact_speed", "departure"
+    values = list_given(options, *names) | {"planner": plan_anew}
+
     def advise() -> str:
-        """Which of longer dwells, a faster loop, half the reserve, and more force would do."""
-        period, epsilon, dwell = min(2e-4, options.period), 2 * problem.epsilon, 4 * options.dwell
+        """Which of a faster loop, half the reserve, and more force would do."""
+        period, epsilon = min(2e-4, options.period), 2 * problem.epsilon
         usual = 2.5 if problem.uncertainty is None else 1.0
         reserve = (usual if options.reserve is None else options.reserve) / 2
         firm = problem.with_({"epsilon": epsilon})
         trials: list[tuple[str, wholearm.Problem, dict[str, Any]]] = [
-            (f"--dwell {dwell:g}", problem, {"dwell": dwell}),
             (f"--period {period:g} --delay 0", problem, {"period": period, "delay": 0.0}),
             (f"--reserve {reserve:g}", problem, {"reserve": reserve}),
             (f"a plan with epsilon = {epsilon:g} N", firm, {}),
@@ -904,16 +907,13 @@ def _policy(options: argparse.Namespace) -> int:
             say(f"trying {words}")
             with suppress(WholearmError):
                 tried = plan if scene is problem else plan_anew(scene)
-                made = wholearm.make_policy(scene, tried, **(values | changes), planner=plan_anew)
-                if wholearm.verify_policy(scene, tried, made, **allowed).ok:
+                if find_policy(scene, tried, **({"contact_speed": 1.0} | values | changes))[1].ok:
                     return f"{words} would do"
         return f"{', '.join(words for words, *_ in trials)} would not do either"
 
     with name_source(options.plan):
-        say("making the policy")
-        made = wholearm.make_policy(problem, plan, **values, planner=plan_anew)
-        say("simulating the policy")
-        report = wholearm.verify_policy(problem, plan, made, **allowed)
+        say("making and simulating the policy")
+        made, report = find_policy(problem, plan, **values)
         if options.largest:
             say("looking for the widest ranges")
             each = find_widest(problem, plan, options.delay)

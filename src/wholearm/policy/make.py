@@ -397,19 +397,24 @@ def scale_ranges(ranges: Mapping[str, float], size: float, delay: float) -> dict
 
 
 def trace_pieces(
-    problem: Problem, plan: Trajectory, size: float, widths: Mapping[str, float] | None
+    problem: Problem,
+    plan: Trajectory,
+    size: float,
+    widths: Mapping[str, float] | None,
+    contact_speed: float = 1.0,
 ) -> dict[int, ReferencePiece]:
     """References of the phases along curves, by index, with margins as large as possible.
 
     Margins are `size` times those of usual errors or, where there are half `widths` of ranges, such
-    that limits are kept within these.
+    that limits are kept within these. `contact_speed` is that of `make_policy`.
     """
     pieces: dict[int, ReferencePiece] = {}
+    touch = contact_speed * SETTINGS.touch * problem.scene.scales.speed
     for block in filter(runs_on_curves, split_blocks(problem)):
         before: ReferencePiece | None = None
         after: ReferencePiece | None = None
         for phase in reversed(block):
-            after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, after)
+            after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, touch, after)
         for phase in block:
             piece = pieces[phase.index]
             first = float(piece.reach.high[0])
@@ -425,6 +430,7 @@ def _trace(
     plan: Trajectory,
     size: float,
     widths: Mapping[str, float] | None,
+    touch: float,
     after: ReferencePiece | None,
 ) -> ReferencePiece:
     """A phase's curve, and the controllable motions along it that keep margins."""
@@ -436,7 +442,7 @@ def _trace(
     s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
     s = s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length]
     a, b, internal = (np.interp(s, places, value) for value in values)
-    touch, begins, passes, end = SETTINGS.touch * problem.scene.scales.speed, float(b[0]), 0.0, None
+    begins, passes, end = float(b[0]), 0.0, None
     impact = phase.end is End.IMPACT and b[-1] > touch**2
     if after is not None and (impact or phase.end is End.SMOOTH):
         passes = after.begins / float(b[-1]) if impact else 1.0
@@ -654,7 +660,7 @@ def make_policy(
     reserve: float | None = None,
     period: float = 1e-3,
     delay: float = 5e-4,
-    dwell: float = SETTINGS.dwell,
+    contact_speed: float = 1.0,
     torque_limit: float | None = None,
     planner: Planner | None = None,
 ) -> Policy:
@@ -668,7 +674,8 @@ def make_policy(
                           (2.5). Where the plan leaves less, the motion is slower; 0: as the plan
     period : [s]          of the control loop
     delay : [s]           from measuring to applying torques, as far as known
-    dwell : [s]           at rest before the next phase begins
+    contact_speed         factor on the speed at which contacts are made; times at rest before the
+                          next phase begins are longer by its inverse square
     torque_limit : [N m]  of both fingers, if the plan was made with less than the hand has
     planner               replans phases with more degrees of freedom that leave no margin, unless
                           `reserve` is 0
@@ -681,7 +688,7 @@ def make_policy(
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
-    dwell = require_number(dwell, "dwell", nonnegative=True)
+    contact_speed = require_number(contact_speed, "contact_speed", positive=True)
     if len(plan.phase_starts) != len(problem.phases) + 1:
         text = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
         raise InputError("", "phases of the plan", text)
@@ -691,9 +698,9 @@ def make_policy(
     settings = LoopSettings(
         period=period,
         delay=delay,
-        touch=SETTINGS.touch * scales.speed,
+        touch=contact_speed * SETTINGS.touch * scales.speed,
         still=STILL * scales.speed,
-        dwell=dwell,
+        dwell=SETTINGS.dwell / contact_speed**2,
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
@@ -703,7 +710,7 @@ def make_policy(
     problem = pass_renamed(problem)
     blocks = split_blocks(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
-    pieces = trace_pieces(problem, plan, reserve, widths)
+    pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block in blocks:
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
