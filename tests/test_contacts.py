@@ -8,17 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from plane import (
-    SQUARE,
-    convex_polygon,
-    finger_gap,
-    is_first_touch,
-    make_formation,
-    make_scene,
-    place_corners,
-    place_tips,
-    rotate,
-)
+import plane
 from rows import each
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
@@ -41,7 +31,7 @@ STEP = 1e-6
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return make_scene(KITE)
+    return plane.make_scene(KITE)
 
 
 def configurations(seed: int, count: int = 20) -> Array:
@@ -85,7 +75,7 @@ def test_bad_name_lists_what_is_allowed(scene: Scene, name: Any) -> None:
 
 
 def test_pointed_tip_has_no_arc() -> None:
-    pointed = make_scene(KITE, radius=0.0)
+    pointed = plane.make_scene(KITE, radius=0.0)
     assert len(candidate_contacts(pointed, 0)) == 10
     with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
         parse_contact("v1-tip1", pointed)
@@ -94,7 +84,7 @@ def test_pointed_tip_has_no_arc() -> None:
 @each("name", NAMES)
 def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
-    formation = make_formation(scene, name)
+    formation = plane.make_formation(scene, name)
     slip, z_symbol = build_pair(formation.contacts[0], scene).slip, build_features(scene).z
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
     rng = np.random.default_rng(6)
@@ -119,11 +109,11 @@ def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
     """Swept from outside, the capsule is clear of the object up to the angle and touches there."""
     rng = np.random.default_rng([int(1e3 * radius), int(1e3 * length)])
     for trial in range(25):
-        points = convex_polygon(rng, int(rng.integers(3, 8)))
-        scene = make_scene(points, length=length, radius=radius, base=0.13, depth=-0.025)
+        points = plane.convex_polygon(rng, int(rng.integers(3, 8)))
+        scene = plane.make_scene(points, length=length, radius=radius, base=0.13, depth=-0.025)
         # Above the palm, between the joints or beyond them.
         phi = rng.uniform(-np.pi, np.pi)
-        lowest = rotate(phi, scene.polygon.vertices)[:, 1].min()
+        lowest = plane.rotate(phi, scene.polygon.vertices)[:, 1].min()
         q = np.array([rng.uniform(-0.09, 0.09), rng.uniform(0.0, 0.02) - lowest, phi])
         finger = trial % 2
         try:
@@ -131,18 +121,18 @@ def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
         except InputError as error:
             assert "too short" in error.problem
             angles = np.linspace(-np.pi, np.pi, 1500)
-            assert (finger_gap(scene, q, finger, angles) > 0).all()
+            assert (plane.finger_gap(scene, q, finger, angles) > 0).all()
             continue
-        assert is_first_touch(scene, q, finger, angle)
+        assert plane.is_first_touch(scene, q, finger, angle)
 
 
 @pytest.mark.parametrize("finger", [0, 1])
 def test_closing_starts_from_straight_down(finger: int) -> None:
     """An object outside the hand and below the joint is met before the finger points outwards."""
-    scene = make_scene(SQUARE, base=0.05, depth=0.12, length=0.1)
+    scene = plane.make_scene(plane.SQUARE, base=0.05, depth=0.12, length=0.1)
     q = np.array([0.12 if finger == 0 else -0.12, 0.03, 0.0])
     angle = closing.close_finger(scene, q, finger)
-    assert is_first_touch(scene, q, finger, angle)
+    assert plane.is_first_touch(scene, q, finger, angle)
     assert abs(angle - (-np.pi / 2 if finger == 0 else 3 * np.pi / 2)) < np.pi / 4
 
 
@@ -158,7 +148,7 @@ def test_closing_starts_from_straight_down(finger: int) -> None:
 )
 def test_touching_names_the_kind(depth: float, x: float, y: float, names: set[str]) -> None:
     """A square beside an upright link, or above its tip."""
-    scene = make_scene(base=0.08, depth=depth, length=0.12)
+    scene = plane.make_scene(base=0.08, depth=depth, length=0.12)
     touching = find_touching(scene, np.array([x, y, 0.0, np.pi / 2, np.pi / 2]))
     assert {contact.name for contact in touching if contact.finger == 0} == names
 
@@ -166,7 +156,7 @@ def test_touching_names_the_kind(depth: float, x: float, y: float, names: set[st
 @pytest.mark.parametrize("base", [[0.0, 0.03], [0.0, -0.004], [0.029, 0.03], [0.034, 0.03]])
 def test_joint_inside_the_object(base: list[float]) -> None:
     """Also where only the rounded end of the link reaches into it."""
-    scene = make_scene(SQUARE)
+    scene = plane.make_scene(plane.SQUARE)
     scene = replace(scene, fingers=(replace(scene.fingers[0], base=base), scene.fingers[1]))
     with pytest.raises(InputError, match="inside the object") as caught:
         closing.close_finger(scene, np.array([0.0, 0.03, 0.0]), 0)
@@ -176,11 +166,11 @@ def test_joint_inside_the_object(base: list[float]) -> None:
 @each("seed", range(5))
 def test_flush_edge_lies_on_the_palm(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    scene = make_scene(convex_polygon(rng, 6))
+    scene = plane.make_scene(plane.convex_polygon(rng, 6))
     for edge in range(6):
         x = rng.uniform(-1, 1)
         q = closing.place_flush(scene, edge, x)
-        heights = place_corners(scene, q)[:, 1]
+        heights = plane.place_corners(scene, q)[:, 1]
         assert q[0] == x and -np.pi < q[2] <= np.pi
         np.testing.assert_allclose(heights[[edge, (edge + 1) % 6]], 0.0, atol=ROUNDING)
         assert heights.min() > -ROUNDING
@@ -188,8 +178,8 @@ def test_flush_edge_lies_on_the_palm(seed: int) -> None:
 
 @each("name", ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v2-tip2"])
 def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
-    scene = make_scene(SQUARE)
-    sliding = make_formation(scene, f"v1-palm {name} v0-finger2")
+    scene = plane.make_scene(plane.SQUARE)
+    sliding = plane.make_formation(scene, f"v1-palm {name} v0-finger2")
     formation = Formation(scene, sliding.contacts, (parse_contact(name, scene),))
     assert (formation.n_contacts, formation.n_rolling, formation.n_constraints) == (3, 1, 4)
     assert formation.rolling_rows == (1,) and formation.contacts == sliding.contacts
@@ -204,15 +194,17 @@ def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
 
 
 def test_only_contacts_roll() -> None:
-    contacts = make_formation(make_scene(SQUARE), "v0-palm v1-palm v2-palm").contacts
+    contacts = plane.make_formation(
+        plane.make_scene(plane.SQUARE), "v0-palm v1-palm v2-palm"
+    ).contacts
     with pytest.raises(ValueError, match="v2-palm roll, which are no contacts"):
-        Formation(make_scene(SQUARE), contacts[:2], contacts[1:])
+        Formation(plane.make_scene(plane.SQUARE), contacts[:2], contacts[1:])
 
 
 UPRIGHT = np.pi / 2
-WIDE = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
-TALL = make_scene(SQUARE, base=0.08, depth=0.0, length=0.06)
-SHORT = make_scene(SQUARE, base=0.08, depth=0.0, length=0.02)
+WIDE = plane.make_scene(plane.SQUARE, base=0.08, depth=0.0, length=0.12)
+TALL = plane.make_scene(plane.SQUARE, base=0.08, depth=0.0, length=0.06)
+SHORT = plane.make_scene(plane.SQUARE, base=0.08, depth=0.0, length=0.02)
 STANDING = np.array([0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 LEFT = np.array([-0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 
@@ -242,7 +234,7 @@ LEFT = np.array([-0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 )
 def test_limits_are_clearances(scene: Scene, names: str, z: Array, text: str, clear: float) -> None:
     """The square stands on the palm beside an upright link."""
-    formation = make_formation(scene, names)
+    formation = plane.make_formation(scene, names)
     texts = [limit.text for limit in formation.limits]
     assert len(set(texts)) == len(texts)
     limit = formation.evaluate_limits(z[None])[0, texts.index(text)]
@@ -266,42 +258,46 @@ def test_limits_are_clearances(scene: Scene, names: str, z: Array, text: str, cl
     ],
 )
 def test_limit_knows_what_is_gained(names: str, text: str, gained: str | None) -> None:
-    limits = {limit.text: limit.gained for limit in make_formation(WIDE, names).limits}
+    limits = {limit.text: limit.gained for limit in plane.make_formation(WIDE, names).limits}
     assert limits[text] == (parse_contact(gained, WIDE) if gained else None)
 
 
 @pytest.mark.parametrize("finger", [0, 1])
 def test_object_may_hang_over_the_back_of_a_tip(finger: int) -> None:
     """The tip holds the lower edge; its outer end hangs lower than the tip, behind the link."""
-    scene = make_scene(SQUARE, length=0.1)
+    scene = plane.make_scene(plane.SQUARE, length=0.1)
     side = 1 if finger == 0 else -1
     angles = np.array([np.pi / 2 - 0.9, np.pi / 2 + 0.9])
     angles[finger] = np.pi / 2
-    normal = rotate(-0.3 * side, [0.0, 1.0])
-    centre = place_tips(scene, finger, angles[finger]) + (0.005 + 0.03) * normal
+    normal = plane.rotate(-0.3 * side, [0.0, 1.0])
+    centre = plane.place_tips(scene, finger, angles[finger]) + (0.005 + 0.03) * normal
     z = np.array([*centre, -0.3 * side, *angles])
-    hanging = place_corners(scene, z)[1 if finger == 0 else 0]
-    assert hanging[1] < place_tips(scene, finger, angles[finger])[1]
-    assert finger_gap(scene, z[:3], finger, angles[finger])[0] == pytest.approx(0.0, abs=1e-13)
-    formation = make_formation(scene, f"e0-tip{finger + 1}")
+    hanging = plane.place_corners(scene, z)[1 if finger == 0 else 0]
+    assert hanging[1] < plane.place_tips(scene, finger, angles[finger])[1]
+    assert plane.finger_gap(scene, z[:3], finger, angles[finger])[0] == pytest.approx(
+        0.0, abs=1e-13
+    )
+    formation = plane.make_formation(scene, f"e0-tip{finger + 1}")
     assert (formation.evaluate_limits(z[None])[0] > 0.01).all()
 
 
 def test_a_joint_right_above_the_object_is_refused() -> None:
     """A link closes from pointing down, which overlaps an object below its joint."""
     flat = [[-0.12, 0.0], [0.12, 0.0], [0.12, 0.02], [-0.12, 0.02]]
-    scene = make_scene(flat, base=0.08, depth=0.05)
+    scene = plane.make_scene(flat, base=0.08, depth=0.05)
     for x in (0.0, 0.05):
         with pytest.raises(InputError, match="right above it") as caught:
             closing.close_finger(scene, np.array([x, 0.01, 0.0]), 0)
         assert caught.value.key == "fingers.1.base"
     beside = closing.close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
-    assert abs(finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12
+    assert abs(plane.finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12
 
 
 def test_limits_outlive_the_scene_that_built_them() -> None:
     corners = [[0.0, 0.0], [0.083, 0.0], [0.0, 0.071]]  # no other test's
-    first, second = (make_formation(make_scene(corners), "v1-finger1 v2-finger2") for _ in range(2))
+    first, second = (
+        plane.make_formation(plane.make_scene(corners), "v1-finger1 v2-finger2") for _ in range(2)
+    )
     assert len(first.limits) == len(second.limits) > 0
     del first
     gc.collect()
@@ -312,7 +308,7 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
 
 def close(radius: float) -> tuple[Scene, closing.Numbers, Array, Array]:
     """A hand with links that are just long enough: labels, poses, and the hand closed there."""
-    scene = make_scene(lengths=(0.11, 0.09), radius=radius)
+    scene = plane.make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)
     x, phi = rng.uniform(-0.06, 0.06, 400), rng.uniform(-4, 4, 400)
     labels = label_cells(scene, x, phi)[:, [0, 2, 4]]

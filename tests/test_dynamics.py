@@ -9,19 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import plane
 from independent import balances, collide
-from plane import (
-    SQUARE,
-    cross,
-    find_null_vector,
-    make_formation,
-    make_scene,
-    measure_gaps,
-    measure_slip,
-    rotate,
-    stack_rows,
-    unbalance,
-)
 from planned import forward
 from resting import list_others, rest_margin
 from scenes import box, read_lines, roll, tipped
@@ -115,11 +104,13 @@ def test_every_body_obeys_newton_and_euler_and_contacts_are_kept(curves: tuple[C
         tau, n_c, rolls = rng.uniform(-1, 1, 2), formation.n_contacts, list(formation.rolling_rows)
         z_ddot, c = forward(formation, z, v, tau, directions)
         assert c.shape == (formation.n_constraints,)
-        slip = measure_slip(formation, z, v)
+        slip = plane.measure_slip(formation, z, v)
         assert (np.abs(slip[rolls]) < 1e-14).all()
         c_t = -formation.friction * np.sign(slip) * c[:n_c]
         c_t[rolls] = c[n_c:]
-        residual, _ = unbalance(formation, Samples(z, v, z_ddot, tau, c[:n_c], c_t), np.sign(v[3:]))
+        residual, _ = plane.unbalance(
+            formation, Samples(z, v, z_ddot, tau, c[:n_c], c_t), np.sign(v[3:])
+        )
         assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c).max())
         # Gap and slip coordinates keep their values to second order: rounding 1e-17 over h^2, and
         # their fourth derivatives times h^2.
@@ -131,10 +122,10 @@ def test_every_body_obeys_newton_and_euler_and_contacts_are_kept(curves: tuple[C
 
 def test_symmetric_squeeze_by_hand() -> None:
     """Links lean inwards on a square's upper corners, where their forces have the arms' length."""
-    scene = make_scene(friction=0.0)
+    scene = plane.make_scene(friction=0.0)
     q = np.array([0.0, 0.03, 0.0])
     z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
-    formation = make_formation(scene, "v0-palm v1-palm v2-finger1 v3-finger2")
+    formation = plane.make_formation(scene, "v0-palm v1-palm v2-finger1 v3-finger2")
     still = Directions(np.ones(4), np.zeros(2))
     z_ddot, c_n = forward(formation, z, np.zeros(5), np.array([0.3, -0.3]), still)
     np.testing.assert_allclose(z_ddot, 0.0, atol=1e-10)
@@ -156,8 +147,8 @@ def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
         ratio = reduced_inertia(formation, kinematics, directions)[0]
         slip = (formation.friction * directions.Xi)[:, None]
         G = (kinematics.A - slip * kinematics.A_t)[0]
-        mass, free = formation.scene.mass_diagonal, find_null_vector(kinematics.A[0])
-        idle = find_null_vector(G)
+        mass, free = formation.scene.mass_diagonal, plane.find_null_vector(kinematics.A[0])
+        idle = plane.find_null_vector(G)
         expected = (free * mass) @ idle / ((free * mass) @ free)
         assert ratio == pytest.approx(expected, rel=1e-9)
 
@@ -199,8 +190,8 @@ def chain_of(path: Path) -> ImpactSequence:
 def check_momenta(impact: Impact, z: Array, before: Array) -> None:
     """Momentum of each body changes by the impulses at its contact points."""
     formation = impact.formation
-    A, A_t = stack_rows(formation, z)
-    slide = formation.friction * np.sign(measure_slip(formation, z, impact.v))
+    A, A_t = plane.stack_rows(formation, z)
+    slide = formation.friction * np.sign(plane.measure_slip(formation, z, impact.v))
     impulse = impact.p @ (A - slide[:, None] * A_t)
     change = formation.scene.mass_diagonal * (impact.v - before)
     np.testing.assert_allclose(change, impulse, rtol=0, atol=1e-12)
@@ -217,7 +208,9 @@ def test_each_body_takes_its_impulses_as_complementarity_says() -> None:
             check_momenta(impact, z, v)
             # Every contact is kept afterwards, and one arrives before.
             steps = 1e-6 * np.array([impact.v, v])
-            kept, arriving = measure_gaps(after, z + steps) - measure_gaps(after, z - steps)
+            kept, arriving = plane.measure_gaps(after, z + steps) - plane.measure_gaps(
+                after, z - steps
+            )
             assert np.abs(kept).max() < 1e-14 and arriving.min() < -1e-7
             # Moreau's law, which assumes neither what presses nor what slides which way.
             released = [c for c in before.contacts if c not in after.contacts]
@@ -246,9 +239,9 @@ def test_what_would_have_to_pull_is_named() -> None:
 
 def test_random_impacts_never_gain_energy() -> None:
     rng = np.random.default_rng(5)
-    scene = make_scene(friction=0.3)
+    scene = plane.make_scene(friction=0.3)
     names = ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"]
-    formations = [make_formation(scene, " ".join(three)) for three in permutations(names, 3)]
+    formations = [plane.make_formation(scene, " ".join(three)) for three in permutations(names, 3)]
     possible = 0
     for number in range(200):
         formation = formations[number % len(formations)]
@@ -258,7 +251,7 @@ def test_random_impacts_never_gain_energy() -> None:
         sound = not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}
         if sound:
             check_momenta(impact, z, v)
-            slips = measure_slip(formation, z, impact.v)
+            slips = plane.measure_slip(formation, z, impact.v)
             assert (impact.Xi * slips >= -1e-9).all()
         else:
             # No directions of sliding agree with the velocities that they lead to.
@@ -279,10 +272,10 @@ def test_random_impacts_never_gain_energy() -> None:
 
 def drop(v: Array, friction: float, lean: float = 0.3) -> tuple[Impact, Array, Scene]:
     """Impact of corner 1 on the palm, and r; the square is turned by `lean`."""
-    scene, r = make_scene(friction=friction), rotate(lean, [0.03, -0.03])
-    formation = make_formation(scene, "v1-palm")
+    scene, r = plane.make_scene(friction=friction), plane.rotate(lean, [0.03, -0.03])
+    formation = plane.make_formation(scene, "v1-palm")
     z = np.array([0.0, -r[1], lean, 0.5, 2.6])
-    assert abs(measure_gaps(formation, z)[0]) < 1e-13
+    assert abs(plane.measure_gaps(formation, z)[0]) < 1e-13
     return compute_impact(formation, formation, z, v), r, scene
 
 
@@ -317,12 +310,12 @@ def test_a_corner_that_rolls(friction: float) -> None:
     """It is caught like a hinge if friction can hold it: angular momentum about it is kept."""
     v, lean = np.array([0.2, -0.4, 0.0, 0.0, 0.0]), 0.7
     _, r, scene = drop(v, friction, lean)
-    sliding = make_formation(scene, "v1-palm")
+    sliding = plane.make_formation(scene, "v1-palm")
     rolling = Formation(scene, sliding.contacts, sliding.contacts)
     z = np.array([0.0, -r[1], lean, 0.5, 2.6])
     impact = compute_impact(sliding, rolling, z, v)
     inertia = scene.mass_diagonal[2]
-    spin = -MASS * float(cross(r, v[:2])) / (inertia + MASS * r @ r)
+    spin = -MASS * float(plane.cross(r, v[:2])) / (inertia + MASS * r @ r)
     expected = np.array([spin * r[1], -spin * r[0], spin, 0.0, 0.0])
     np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)
     tangential, normal = MASS * (expected[:2] - v[:2])
@@ -351,13 +344,16 @@ def test_jamming_is_named() -> None:
 
 def test_what_touches_must_not_be_driven_into() -> None:
     """A square flush on the palm cannot turn about its right corner into the palm."""
-    scene = make_scene(SQUARE)
-    flush, corner = make_formation(scene, "v0-palm v1-palm"), make_formation(scene, "v1-palm")
+    scene = plane.make_scene(plane.SQUARE)
+    flush, corner = (
+        plane.make_formation(scene, "v0-palm v1-palm"),
+        plane.make_formation(scene, "v1-palm"),
+    )
     z = np.array([0.0, 0.03, 0.0, 0.5, 2.6])
     for spin in (-2.0, 2.0):
         v = np.array([0.5, -0.03 * spin, spin, 0.0, 0.0])
         impact = compute_impact(flush, corner, z, v)
-        rate = float(measure_gaps(flush, z + 1e-6 * impact.v)[0]) / 1e-6
+        rate = float(plane.measure_gaps(flush, z + 1e-6 * impact.v)[0]) / 1e-6
         closing = [h for h in impact.violations if h.kind is ViolationKind.CLOSING]
         assert impact.possible == (spin < 0) == (rate > 0)
         if spin > 0:
@@ -500,11 +496,11 @@ def test_forces_are_unique_where_all_minors_are_positive(index: int, share: floa
 
 def test_a_rod_on_the_palm_is_that_of_painleve() -> None:
     """Friction mu takes mu a h / (k^2 + a^2) from 1, a and h being the arms of both forces."""
-    scene = make_scene([[-0.05, -1e-4], [0.05, -1e-4], [0.05, 1e-4], [-0.05, 1e-4]], base=0.6)
+    scene = plane.make_scene([[-0.05, -1e-4], [0.05, -1e-4], [0.05, 1e-4], [-0.05, 1e-4]], base=0.6)
     for slope, mu in product((0.4, 1.0, 1.3), (0.5, 2.0)):
         other = Scene(scene.polygon, scene.fingers, Friction(mu, 0.1, 0.1))
-        formation = make_formation(other, "v1-palm")
-        arm, height = rotate(-slope, [0.05, -1e-4])
+        formation = plane.make_formation(other, "v1-palm")
+        arm, height = plane.rotate(-slope, [0.05, -1e-4])
         z = np.array([[0.0, -height, -slope, 1.57, 1.57]])
         kinematics = formation.evaluate(z, np.zeros((1, 5)))
         loss = mu * arm * abs(height) / (scene.polygon.gyration_radius**2 + arm**2)

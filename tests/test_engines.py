@@ -16,14 +16,7 @@ from shipped import HEPTAGON, plan_of, problem_of
 from wholearm import InputError, Plan, Problem, find_route, make_policy, verify, write_mjcf
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.engines.engine_replay import (
-    Departure,
-    EngineReport,
-    Level,
-    compare,
-    play_policy,
-    replay_in,
-)
+from wholearm.engines import engine_replay
 from wholearm.engines.interface import (
     EngineRun,
     Setting,
@@ -188,7 +181,7 @@ def slide() -> tuple[Problem, Plan]:
 def test_an_engine_keeps_to_the_plan(engine: str) -> None:
     pytest.importorskip(EXTRAS[engine], reason=f"wholearm[{engine}] is not installed")
     problem, plan = slide()
-    report = replay_in(engine, problem, plan, setting=COARSE)
+    report = engine_replay.replay_in(engine, problem, plan, setting=COARSE)
     assert report.ok and report.exit_status == 0, report.to_text()
     (found,) = report.levels[0].departures
     assert found.position.max() < 1e-4 and found.angle.max() < 3.5e-3
@@ -204,13 +197,15 @@ def test_a_policy_moves_the_hand_in_an_engine(engine: str) -> None:
     pytest.importorskip(EXTRAS[engine], reason=f"wholearm[{engine}] is not installed")
     problem, plan = slide()
     policy = make_policy(problem, plan)
-    report = play_policy(engine, problem, plan, policy, setting=COARSE)
+    report = engine_replay.play_policy(engine, problem, plan, policy, setting=COARSE)
     assert report.ok and report.exit_status == 0, report.to_text()
     (arrival,) = report.arrivals
     assert arrival.position < 1e-4 and arrival.gap < 1e-5
     assert json.loads(json.dumps(report.to_dict()))["stretches"][0]["phases"] == [1]
     # By feedback it ends where it is to end with other friction, too.
-    other = play_policy(engine, problem.with_(friction=0.12), plan, policy, setting=COARSE)
+    other = engine_replay.play_policy(
+        engine, problem.with_(friction=0.12), plan, policy, setting=COARSE
+    )
     assert other.ok, other.to_text()
 
 
@@ -234,7 +229,7 @@ def test_what_mujoco_opens_plays_the_plan() -> None:
 def test_an_engine_with_other_friction_departs(engine: str) -> None:
     pytest.importorskip(EXTRAS[engine], reason=f"wholearm[{engine}] is not installed")
     problem, plan = slide()
-    report = replay_in(engine, problem.with_(friction=0.2), plan, setting=COARSE)
+    report = engine_replay.replay_in(engine, problem.with_(friction=0.2), plan, setting=COARSE)
     assert report.exit_status == 1
     lines = report.to_text().splitlines()
     assert "DEPARTS" in lines[0] and lines[1].startswith("phase 1 departs at t = ")
@@ -254,7 +249,7 @@ def test_contacts_of_light_links_are_no_stiffer_than_the_step_allows() -> None:
     problem = build_problem(table)
     plan = find_route(problem).plan
     # The problem with its goal, and a plan, go where phases and a motion do.
-    report = replay_in("mujoco", problem, plan)
+    report = engine_replay.replay_in("mujoco", problem, plan)
     assert report.ok and report.converged
     assert report.levels[0].departures[0].position.max() < 5e-4
     assert verify(problem, plan).ok
@@ -264,11 +259,11 @@ def test_what_departs_with_some_settings_only_has_not_converged() -> None:
     problem, plan = slide()
     (stretch,) = list_stretches(plan.trajectory, [0])
     nothing = np.zeros(1)
-    held = Departure(nothing, nothing, nothing, (), None, "")
+    held = engine_replay.Departure(nothing, nothing, nothing, (), None, "")
     lost = held._replace(time=0.01, reason="v0-palm opens at t = 0.01 s")
     for finer, verdict in ((held, "NOT CONVERGED"), (lost, "DEPARTS")):
-        levels = tuple(Level(COARSE, (own,)) for own in (lost, finer))
-        report = EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
+        levels = tuple(engine_replay.Level(COARSE, (own,)) for own in (lost, finer))
+        report = engine_replay.EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
         assert report.exit_status == 1 and f": {verdict}: " in report.to_text().splitlines()[0]
 
 
@@ -312,9 +307,11 @@ def follow() -> EngineRun:
     return EngineRun(stretch.start + t, planned.z, planned.z_dot, names, press)
 
 
-def judge(run: EngineRun) -> Departure:
+def judge(run: EngineRun) -> engine_replay.Departure:
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
-    return compare(problem, plan, list_stretches(plan, range(len(plan.motions)))[PHASE], run, 1e-3)
+    return engine_replay.compare(
+        problem, plan, list_stretches(plan, range(len(plan.motions)))[PHASE], run, 1e-3
+    )
 
 
 def test_what_goes_as_planned_does_not_depart() -> None:

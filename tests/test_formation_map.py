@@ -13,20 +13,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+import plane
 import shipped
 from once import once
-from plane import (
-    SQUARE,
-    convex_polygon,
-    finger_gap,
-    is_first_touch,
-    make_finger,
-    make_formation,
-    make_scene,
-    place_corners,
-    point_to_segment,
-    rotate,
-)
 from retelling import Retelling
 from scenes import hexagon, measure_fingers
 from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved, text_of
@@ -81,14 +70,14 @@ def distance_to(borders: list[Border], points: Array) -> Array:
     scale = np.array([1.0, 0.05])
     starts = np.concatenate([b.points[:-1] for b in borders]) * scale
     ends = np.concatenate([b.points[1:] for b in borders]) * scale
-    return np.array([point_to_segment(p * scale, starts, ends).min() for p in points])
+    return np.array([plane.point_to_segment(p * scale, starts, ends).min() for p in points])
 
 
 @pytest.mark.parametrize("radius", [0.005, 0.0])
 def test_closing_many_agrees_with_closing_one(radius: float) -> None:
     points = np.asarray(TABLE["object"]["vertices"])
     # Joints above the palm, so that they get into the object too.
-    scene = make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
+    scene = plane.make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
     rng = np.random.default_rng(1)
     x, phi = rng.uniform(-0.2, 0.2, 50), rng.uniform(-4.0, 4.0, 50)
     closed = close_fingers(scene, x, phi)
@@ -105,7 +94,7 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
                 continue
             assert close_finger(scene, closed.z[row, :3], finger) == pytest.approx(angle, abs=1e-12)
             # asin and acos lose half the digits where a vertex is at the joint or the reach ends.
-            assert is_first_touch(scene, closed.z[row, :3], finger, angle, 1e-9, 300)
+            assert plane.is_first_touch(scene, closed.z[row, :3], finger, angle, 1e-9, 300)
             contact = contact_table(scene)[closed.touched[row, finger]]
             assert contact.finger == finger
             assert abs(gaps(scene, [contact], closed.z[[row]])[0, 0]) < 1e-9
@@ -120,12 +109,12 @@ def test_closing_on_many_vertices_finds_the_first_of_them(radius: float) -> None
     seen = set()
     for flatness, length in ((1.0, 0.18), (0.3, 0.06), (0.15, 0.1)):
         points = 0.05 * np.column_stack([np.cos(angles), flatness * np.sin(angles)])
-        scene = make_scene(points, base=0.06, depth=-0.012, length=length, radius=radius)
+        scene = plane.make_scene(points, base=0.06, depth=-0.012, length=length, radius=radius)
         x, phi = rng.uniform(-0.12, 0.12, 20), rng.uniform(-4.0, 4.0, 20)
         closed = close_fingers(scene, x, phi)
         for row, finger in np.argwhere(closed.obstacle == 0):
             z = closed.z[row]
-            assert is_first_touch(scene, z[:3], finger, z[3 + finger], 1e-9, 300)
+            assert plane.is_first_touch(scene, z[:3], finger, z[3 + finger], 1e-9, 300)
             contact = contact_table(scene)[closed.touched[row, finger]]
             assert abs(gaps(scene, [contact], z[None])[0, 0]) < 1e-9
             seen.add((contact.feature, contact.surface))
@@ -139,11 +128,11 @@ def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> N
     chosen = rng.choice(len(rows), 200, replace=False)
     rows, columns = rows[chosen], columns[chosen]
     z = close_fingers(scene, every.x[columns], every.phi[rows]).z
-    lowest = place_corners(scene, z)[..., 1].min(axis=1)
+    lowest = plane.place_corners(scene, z)[..., 1].min(axis=1)
     np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-13)
     for finger in (0, 1):
         # Distances of polygon and segment in plain geometry; rounding only.
-        assert np.abs(finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])).max() < 1e-10
+        assert np.abs(plane.finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])).max() < 1e-10
     cells = every.cell[rows, columns]
     for cell in np.unique(cells):
         contacts = every.formations[cell]
@@ -160,7 +149,7 @@ def test_cells_that_cannot_be_reached_say_why(every: FormationMap) -> None:
         z = close_fingers(scene, every.x[[column]], every.phi[[row]]).z[0]
         angles = np.linspace(-np.pi, np.pi, 500)
         # Wherever the finger turns, it stays off the object.
-        assert finger_gap(scene, z[:3], -code - 1, angles).min() > 0
+        assert plane.finger_gap(scene, z[:3], -code - 1, angles).min() > 0
 
 
 def test_borders_have_four_closed_contacts_and_edges_flush_on_palm_or_link(
@@ -178,7 +167,7 @@ def test_borders_have_four_closed_contacts_and_edges_flush_on_palm_or_link(
             continue
         finger, edge = border.flush
         for z in border.z[[0, len(border.z) // 2]]:
-            corners = place_corners(scene, z)
+            corners = plane.place_corners(scene, z)
             run = np.roll(corners, -1, axis=0)[edge] - corners[edge]
             heading = 0.0 if finger is None else z[3 + finger]
             across = run @ np.array([-np.sin(heading), np.cos(heading)])
@@ -404,18 +393,20 @@ ROUNDING = 1e-15
 def random_scene(rng: np.random.Generator, radius: float, count: int = 5) -> Scene:
     """One link whose length is between a part and twice of the object's size."""
     length = rng.uniform(0.03, 0.2)
-    scene = make_scene(convex_polygon(rng, count), length=length, radius=radius, base=0.05)
+    scene = plane.make_scene(
+        plane.convex_polygon(rng, count), length=length, radius=radius, base=0.05
+    )
     return replace(scene, fingers_collide=False)
 
 
 def link_gaps(scene: Scene, finger: int, z: Array) -> Array:
-    return finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])
+    return plane.finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])
 
 
 def approach(rng: np.random.Generator, scene: Scene, finger: int) -> Array:
     """A place where a corner or an edge is within 2 mm of some point of a link's outline."""
     link, phi = scene.fingers[finger], rng.uniform(-np.pi, np.pi)
-    corners = rotate(phi, scene.polygon.vertices)
+    corners = plane.rotate(phi, scene.polygon.vertices)
     one, other = corners[[k := int(rng.integers(len(corners))), k - 1]]
     on_edge = one + np.clip(rng.uniform(-0.5, 1.0), 0, 1) * (other - one)
     away = np.arctan2(*-on_edge[::-1]) + rng.uniform(-0.5, 0.5)
@@ -445,7 +436,7 @@ def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
     seen = {True: 0, False: 0}
     for _ in range(3):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
-        formation = make_formation(scene, "v0-palm")
+        formation = plane.make_formation(scene, "v0-palm")
         z = np.array([approach(rng, scene, finger) for _ in range(250)])
         values = formation.evaluate_limits(z)
         for gap, row in zip(link_gaps(scene, finger, z), values, strict=True):
@@ -467,14 +458,14 @@ def hold(rng: np.random.Generator, scene: Scene, name: str) -> Array:
     assert contact.finger is not None
     link, (angle, phi) = scene.fingers[contact.finger], rng.uniform(-np.pi, np.pi, 2)
     axis = np.array([np.cos(angle), np.sin(angle)])
-    corners = rotate(phi, scene.polygon.vertices)
+    corners = plane.rotate(phi, scene.polygon.vertices)
     one, other = corners[[contact.index, (contact.index + 1) % len(corners)]]
-    share, normal, on_body = 1.0, rotate(rng.uniform(-np.pi / 2, np.pi / 2), axis), one
+    share, normal, on_body = 1.0, plane.rotate(rng.uniform(-np.pi / 2, np.pi / 2), axis), one
     if contact.surface == "finger":
         share = rng.uniform(0.02, 0.98)
-        normal = rotate(np.pi / 2 if contact.finger == 0 else -np.pi / 2, axis)
+        normal = plane.rotate(np.pi / 2 if contact.finger == 0 else -np.pi / 2, axis)
     elif contact.feature == "e":
-        normal = rotate(np.pi / 2, other - one) / np.hypot(*(other - one))
+        normal = plane.rotate(np.pi / 2, other - one) / np.hypot(*(other - one))
         on_body = one + rng.uniform(0.02, 0.98) * (other - one)
     at = np.asarray(link.base) + share * link.length * axis + link.radius * normal - on_body
     return np.array([*at, phi, angle, angle])
@@ -492,7 +483,7 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
     seen = {True: 0, False: 0}
     for _ in range(3):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
-        formation = make_formation(scene, name)
+        formation = plane.make_formation(scene, name)
         z = np.array([hold(rng, scene, name) for _ in range(56)])
         assert np.abs(formation.evaluate(z, z).C).max() < 1e-14
         # A little smaller, the object touches nothing where it only touched.
@@ -512,7 +503,7 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
 
 def random_link(rng: np.random.Generator, side: float) -> Finger:
     base = side * rng.uniform(0.01, 0.1), rng.uniform(-0.05, 0.02)
-    return make_finger(base, rng.uniform(0.05, 0.25), rng.choice([0.0, 0.004, 0.02]))
+    return plane.make_finger(base, rng.uniform(0.05, 0.25), rng.choice([0.0, 0.004, 0.02]))
 
 
 def random_angles(rng: np.random.Generator, count: int) -> Array:
@@ -523,7 +514,7 @@ def test_the_gap_is_the_distance_or_minus_the_least_push_that_parts() -> None:
     seen, rng = np.zeros(2, dtype=int), np.random.default_rng(0)
     for _ in range(36):
         fingers = random_link(rng, 1.0), random_link(rng, -1.0)
-        scene, z = replace(make_scene(), fingers=fingers), random_angles(rng, 400)
+        scene, z = replace(plane.make_scene(), fingers=fingers), random_angles(rng, 400)
         gap = evaluate_finger_gap(scene, z)
         np.testing.assert_allclose(gap, measure_fingers(scene, z), atol=1e-14)
         crossed = gap < -sum(link.radius for link in scene.fingers)
@@ -533,7 +524,7 @@ def test_the_gap_is_the_distance_or_minus_the_least_push_that_parts() -> None:
 
 def test_ends_that_coincide_touch() -> None:
     """Two pointed links that meet at their tips."""
-    scene = make_scene(SQUARE, base=0.06, depth=0.0, length=0.1, radius=0.0)
+    scene = plane.make_scene(plane.SQUARE, base=0.06, depth=0.0, length=0.1, radius=0.0)
     z = np.zeros((1, 5))
     z[0, 3:] = np.arccos(-0.6), np.arccos(0.6)
     assert evaluate_finger_gap(scene, z) == pytest.approx(0.0, abs=1e-14)
@@ -544,15 +535,15 @@ def test_ends_that_coincide_touch() -> None:
 
 
 def test_the_gap_is_a_limit_of_every_formation() -> None:
-    scene = make_scene(SQUARE)
+    scene = plane.make_scene(plane.SQUARE)
     for names in ("v0-palm v1-palm", "v0-palm v2-finger1 e3-tip2"):
-        formation = make_formation(scene, names)
+        formation = plane.make_formation(scene, names)
         (index,) = [k for k, e in enumerate(formation.limits) if e.text == FINGERS_TOUCH]
         assert formation.limits[index].gained is None
         z = random_angles(np.random.default_rng(5), 20)
         values = formation.evaluate_limits(z)[:, index]
         np.testing.assert_allclose(values, evaluate_finger_gap(scene, z), atol=ROUNDING)
-    passing = make_formation(replace(scene, fingers_collide=False), "v0-palm v1-palm")
+    passing = plane.make_formation(replace(scene, fingers_collide=False), "v0-palm v1-palm")
     assert FINGERS_TOUCH not in [limit.text for limit in passing.limits]
 
 

@@ -24,17 +24,8 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.policy import regulator
+from wholearm.policy import make, regulator
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
-from wholearm.policy.make import (
-    SETTINGS,
-    find_widest,
-    find_within,
-    list_scenes,
-    make_policy,
-    retime,
-    retime_within,
-)
 from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
 from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
@@ -57,7 +48,7 @@ def plan(problem: Problem) -> Plan:
 
 @pytest.fixture(scope="module")
 def policy(problem: Problem, plan: Plan) -> Policy:
-    return make_policy(problem, plan.trajectory)
+    return make.make_policy(problem, plan.trajectory)
 
 
 def test_pressing_against_a_new_contact_lifts_no_light_object() -> None:
@@ -67,7 +58,7 @@ def test_pressing_against_a_new_contact_lifts_no_light_object() -> None:
     third = {"contacts": ["v0-palm", "v1-palm", "v2-finger1", "v0-finger2"], "until": {"x": 0.0263}}
     problem = build_problem({**table, "phases": [*table["phases"], third]})
     plan = wholearm.solve(problem, replay=False).trajectory
-    assert not verify_policy(problem, plan, make_policy(problem, plan)).failures
+    assert not verify_policy(problem, plan, make.make_policy(problem, plan)).failures
 
 
 def test_the_squeeze_has_the_largest_least_level() -> None:
@@ -104,17 +95,17 @@ def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     limits = np.array([[2.0, -1.0, 0, 0, 0], [2.0, 1.0, 0, 0, 0]])
     slack = np.tile(limits, (21, 1, 1))
     cap = 12 * np.minimum(s, 1 - s)
-    b = retime(s, slack, np.zeros((21, 2)), cap).run(0.0)
+    b = make.retime(s, slack, np.zeros((21, 2)), cap).run(0.0)
     assert b == pytest.approx(4 * np.minimum(s, 1 - s), abs=1e-9)
     # Half of it is kept in reserve.
-    b = retime(s, slack, np.ones((21, 2)), b).run(0.0)
+    b = make.retime(s, slack, np.ones((21, 2)), b).run(0.0)
     assert b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
 
 
 def test_the_joints_show_an_impact() -> None:
     problem = part_of(problem_of(IMPACTS), 0, 2).with_({"phases[2].end": "rest"})
     plan = wholearm.solve(problem, replay=False).trajectory
-    policy = make_policy(problem, plan)
+    policy = make.make_policy(problem, plan)
     first, second = policy.laws
     assert isinstance(first, CurveLaw) and isinstance(second, CurveLaw)
     # The reference goes on as fast as the impact of the plan leaves it.
@@ -134,7 +125,7 @@ def test_the_joints_show_an_impact() -> None:
 def test_without_a_reserve_it_is_as_fast_as_the_plan(
     problem: Problem, plan: Plan, policy: Policy
 ) -> None:
-    own = make_policy(problem, plan.trajectory, reserve=0.0).about["phases"]
+    own = make.make_policy(problem, plan.trajectory, reserve=0.0).about["phases"]
     for phase, with_reserve in zip(own, policy.about["phases"], strict=True):
         assert phase["plan"] <= phase["duration"] < with_reserve["duration"]
         assert with_reserve["duration"] < 1.5 * phase["plan"]
@@ -259,7 +250,7 @@ def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> N
     own = part_of(problem, 0, 1).with_(settle=0.01)
     plan = wholearm.solve(own, replay=False).trajectory
     assert plan.held.any()
-    (law,) = make_policy(own, plan).laws
+    (law,) = make.make_policy(own, plan).laws
     assert law.push == pytest.approx(plan.tau[-1].tolist())
 
 
@@ -267,7 +258,7 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
     # A link passes with its side, over its tip, to an edge.
     problem = part_of(build_problem(tomllib.loads(PENTAGON)), 0, 4)
     plan = wholearm.solve(problem, replay=False).trajectory
-    policy = make_policy(problem, plan)
+    policy = make.make_policy(problem, plan)
     assert [len(law.starts) for law in policy.laws] == [1, 3]
     policy.save(tmp_path / "policy.npz")
     report = verify_policy(problem, plan, Policy.load(tmp_path / "policy.npz"))
@@ -296,13 +287,13 @@ def test_a_stop_where_a_contact_changes_its_name_is_passed() -> None:
     phases = tuple(replace(phase, end=End.REST) for phase in problem.phases)
     problem = replace(problem, phases=phases)
     plan = wholearm.solve(problem, replay=False).trajectory
-    policy = make_policy(problem, plan)
+    policy = make.make_policy(problem, plan)
     assert [len(law.starts) for law in policy.laws] == [1, 2]
     report = verify_policy(problem, plan, policy)
     assert report.ok and not report.phases[2].losses
     row = np.flatnonzero(report.trajectory.t > report.phases[2].start)[0]
     speed = np.abs(report.trajectory.z_dot[row, 3:]).max()
-    assert speed > 0.1 * SETTINGS.touch * problem.scene.scales.rate
+    assert speed > 0.1 * make.SETTINGS.touch * problem.scene.scales.rate
 
 
 def test_a_contact_may_be_open_for_a_moment_where_a_phase_begins(problem: Problem) -> None:
@@ -410,7 +401,7 @@ def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:
     for name in ("theta", "rates", "tau"):
         array = tables[0][name]
         assert tables[1][name] == pytest.approx(array, abs=5e-3 * np.abs(array).max()), name
-    policy = make_policy(problem, plan, planner=planner)
+    policy = make.make_policy(problem, plan, planner=planner)
     law = policy.laws[-1]
     assert isinstance(law, MotionLaw)
     # The plan's torques are at their limit, the policy's leave some of it to feedback.
@@ -442,7 +433,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     widths |= {"mass": 0.1, "inertia": 0.1}
     curve = trace_phase(ranged.phases[0], ranged.start, ())
     s = curve.length * np.array([0.1, 0.2, 0.3])
-    within = find_within(curve, s, np.zeros(3), widths, ranged.epsilon)
+    within = make.find_within(curve, s, np.zeros(3), widths, ranged.epsilon)
     a, b, squeeze = np.array([3.0, 0.0, -4.0]), np.array([0.1, 0.2, 0.1]), np.full(3, 2.0)
     known = np.column_stack([np.ones(3), a, b, np.sqrt(b), squeeze])
     tau = np.einsum("nfq,nq->nf", within.torque, known)
@@ -450,7 +441,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     assert part.stop > s[-1]
     z_dot = point.z_s * np.sqrt(b)[:, None]
     signs = [np.tile(own, (3, 1)).T for own in (part.Xi, part.sigma)]
-    least, scenes = np.full((3, 4), np.inf), list_scenes(ranged.scene, widths)
+    least, scenes = np.full((3, 4), np.inf), make.list_scenes(ranged.scene, widths)
     assert len(scenes) == 32
     for scene in scenes:
         forward = build_forward(replace(curve.formation, scene=scene)).map(3)
@@ -466,7 +457,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
 def test_contacts_are_kept_in_corners_of_the_ranges(
     ranged: Problem, ranged_plan: Trajectory
 ) -> None:
-    policy = make_policy(ranged, ranged_plan)
+    policy = make.make_policy(ranged, ranged_plan)
     assert policy.about["phases"][0]["share"] == 1.0
     assert policy.duration < 1.6 * ranged_plan.duration
     trial = make_trial(ranged, ranged_plan, Uncertainty(RANGES, None), None, policy)
@@ -483,11 +474,11 @@ def test_ranges_that_are_too_wide_are_kept_in_part(
     s = np.linspace(0.0, curve.length, 11)
     b = 0.05 * (4 * s * (curve.length - s) / curve.length**2)
     motion = np.gradient(b, s) / 2, b, np.ones(11)
-    found, share = retime_within(curve, s, motion, {"mass": 0.5, "friction_palm": 1.0}, 0.2)
+    found, share = make.retime_within(curve, s, motion, {"mass": 0.5, "friction_palm": 1.0}, 0.2)
     assert 0.0 < share < 1.0 and found is not None
     assert (found[1].run(0.0) <= b + 1e-12).all()
     with pytest.raises(InputError, match="uncertainty: is missing"):
-        find_widest(replace(ranged, uncertainty=None), ranged_plan, 0.0)
+        make.find_widest(replace(ranged, uncertainty=None), ranged_plan, 0.0)
 
 
 def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
@@ -496,7 +487,7 @@ def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
     known = np.array([1.0, 1.0, 0.1, np.sqrt(0.1), 2.0])
 
     def measure(widths: dict[str, float]) -> np.ndarray:
-        rows, _, _ = find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)
+        rows, _, _ = make.find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)
         return np.asarray(rows.slack[0, :4] @ known)
 
     # Forces are affine in torques: what a gain takes away is in proportion to it.

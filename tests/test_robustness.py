@@ -41,13 +41,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.parallel import connect, run_all
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import (
-    Directions,
-    build_forward,
-    inverse,
-    metric_weights,
-    stack_motion,
-)
+from wholearm.mechanics import dynamics
 from wholearm.mechanics.sensitivity import find_force_slopes, find_slopes_at
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.phase_plan import PhasePlan
@@ -355,7 +349,7 @@ RADII = {"mass": 0.02, "friction_palm": 0.02, "friction_finger1": 0.02, "frictio
 
 def replace_nearby(formation: Formation, z: Array, v: Array) -> tuple[Array, Array]:
     """The nearest configuration of a changed formation, and the nearest velocity there."""
-    root = np.sqrt(metric_weights(formation.scene))
+    root = np.sqrt(dynamics.metric_weights(formation.scene))
     found, slip = z.copy(), formation.evaluate_slip(z[None])[0]
     for _ in range(8):
         own = formation.evaluate(found[None], z[None])
@@ -366,7 +360,7 @@ def replace_nearby(formation: Formation, z: Array, v: Array) -> tuple[Array, Arr
     return found, v - np.linalg.pinv(P / root) @ (P @ v) / root
 
 
-State = tuple[Array, Array, Array, Directions]
+State = tuple[Array, Array, Array, dynamics.Directions]
 """Configuration, velocity, torques, and directions of friction."""
 
 
@@ -381,7 +375,7 @@ def solve_forces(
     else:
         formation = replace(formation, scene=change_problem(heptagon, {name: change}).scene)
         z, v = replace_nearby(formation, z, v)
-    found = build_forward(formation)(z, v, tau, directions.Xi, directions.sigma)
+    found = dynamics.build_forward(formation)(z, v, tau, directions.Xi, directions.sigma)
     return np.asarray(found[1].full()[:, 0])
 
 
@@ -412,13 +406,16 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(which: str) -> None:
     point = way.evaluate(np.array([s]))
     segment = np.searchsorted([part.stop for part in way.segments][:-1], [s])
     directions = directions_of(way, segment)
-    forces = inverse(way.formation, *point[:3], directions, point.kinematics)
+    forces = dynamics.inverse(way.formation, *point[:3], directions, point.kinematics)
     table = find_force_slopes(way.formation, point, directions, forces, [*names, "start_x"])[0]
-    slopes = table @ stack_motion(a, b, squeeze)[0]
-    tau, here = forces.tau(a, b, squeeze)[0], Directions(directions.Xi[0], directions.sigma[0])
+    slopes = table @ dynamics.stack_motion(a, b, squeeze)[0]
+    tau, here = (
+        forces.tau(a, b, squeeze)[0],
+        dynamics.Directions(directions.Xi[0], directions.sigma[0]),
+    )
     state = point.z[0], point.z_s[0] * np.sqrt(b), tau, here
     require_slopes(own, way.formation, state, names, slopes)
-    size = np.sqrt(point.z_s[0, :3] ** 2 @ metric_weights(own.scene)[:3])
+    size = np.sqrt(point.z_s[0, :3] ** 2 @ dynamics.metric_weights(own.scene)[:3])
     step, ends = 1e-6, []
     for sign in (-1, 1):
         moved = way.evaluate(np.array([s + sign * step / size]))
@@ -432,12 +429,12 @@ def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(heptagon: Problem
     formation, z = Formation(heptagon.scene, tuple(contacts)), heptagon.start
     kinematics = formation.evaluate(z[None], z[None])
     v = np.linalg.svd(kinematics.P[0])[2][3:].T @ [0.2, -0.5]
-    here = Directions(np.sign(kinematics.A_t[0] @ v), np.sign(v[3:]))
+    here = dynamics.Directions(np.sign(kinematics.A_t[0] @ v), np.sign(v[3:]))
     tau = np.array([0.7, -0.9])
-    found = build_forward(formation)(z, v, tau, here.Xi, here.sigma)
+    found = dynamics.build_forward(formation)(z, v, tau, here.Xi, here.sigma)
     z_ddot, c = (part.full()[:, 0] for part in found[:2])
     samples = Samples(*(part[None] for part in (z, v, z_ddot, tau, c, -0.1 * here.Xi * c)))
-    rows = Directions(here.Xi[None], here.sigma[None])
+    rows = dynamics.Directions(here.Xi[None], here.sigma[None])
     slopes = find_slopes_at(formation, samples, rows, OFF)[0]
     require_slopes(heptagon, formation, (z, v, tau, here), OFF, slopes)
     along = find_slopes_at(formation, samples, rows, ["start_x"])[0, :, 0]
@@ -452,7 +449,7 @@ def find_least_in_corners(heptagon: Problem, formation: Formation, motion: Motio
     for signs in product((-1, 1), repeat=len(RADII)):
         changes = {name: sign * RADII[name] for name, sign in zip(RADII, signs, strict=True)}
         scene = change_problem(heptagon, changes).scene
-        forward = build_forward(replace(formation, scene=scene)).map(len(Xi))
+        forward = dynamics.build_forward(replace(formation, scene=scene)).map(len(Xi))
         given = samples.z.T, samples.z_dot.T, samples.tau.T, Xi.T, sigma.T
         least = np.minimum(least, forward(*given)[1].full().T)
     return least

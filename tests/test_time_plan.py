@@ -14,39 +14,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import scenes
+import shipped
 import wholearm.planning.time_domain.guesses as guesses
 from once import once
 from plane import finger_gap, make_formation, measure_gaps, measure_slip, unbalance
 from planned import plan_landing as known_landing
-from scenes import (
-    LYING,
-    PALM,
-    box,
-    heave,
-    lift,
-    make_way,
-    measure_fingers,
-    raised,
-    roll,
-    shove,
-    tilting,
-    tipped,
-)
-from shipped import (
-    FOLDER,
-    HEPTAGON,
-    IMPACTS,
-    LANDING,
-    SQUARE,
-    part_of,
-    plan_of,
-    problem_of,
-    tipping,
-)
 from timed import fastest_landing, instants, integrate, landing, plan_landing, stages_of, total
 from wholearm import (
     End,
     Formation,
+    InfeasibleError,
     InputError,
     PlanOptions,
     Problem,
@@ -60,10 +38,13 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights
 from wholearm.mechanics.impact import compute_impact
+from wholearm.planning.nlp import Solver, build_solver
+from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import time_nlp, time_plan
 from wholearm.planning.time_domain.guesses import guess_stages, list_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, find_least
+from wholearm.planning.time_domain.solution import ITERATIONS, SETTINGS, TimeSearch, find_least
 from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
@@ -111,7 +92,10 @@ def test_least_times_agree_with_those_along_the_curve(
     curves: tuple[Curve, ...], trajectory: Trajectory
 ) -> None:
     """The heptagon's last slide, over time."""
-    problem, expected = part_of(problem_of(HEPTAGON), 2, 3), trajectory.meta["phase_durations"][2]
+    problem, expected = (
+        shipped.part_of(shipped.problem_of(shipped.HEPTAGON), 2, 3),
+        trajectory.meta["phase_durations"][2],
+    )
     plan = solve(problem, transcription="time", time_intervals=8, replay=False).trajectory
     (motion,) = plan.motions
     assert isinstance(motion, TimeMotion) and plan.meta["transcription"] == "time"
@@ -146,11 +130,11 @@ def test_schemes_and_degrees_agree(
 
 def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     """The phase in which the box tips over a vertex."""
-    problem = part_of(box(), 1, 2)
+    problem = shipped.part_of(scenes.box(), 1, 2)
     options: dict[str, Any] = {"time_intervals": 16, "mode_search": False, "accuracy": 1e-2}
     within = solve(problem, transcription="time", replay=False, **options)
     # Torques that are linear in each interval cost less than the accuracy asked for.
-    assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
+    assert -1e-4 < within.duration / scenes.tipped().meta["phase_durations"][1] - 1 < 1e-2
     rolls = problem.phases[0].formation.rolling
     (motion,) = within.trajectory.motions
     assert isinstance(motion, TimeMotion) and len(rolls) == 1
@@ -158,7 +142,9 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
         samples = stage.evaluate(instants(stage, 9))
         for k, contact in enumerate(stage.formation.contacts):
             if contact in rolls:
-                grip = PALM * (samples.c_n[:, k] - problem.epsilon) - np.abs(samples.c_t[:, k])
+                grip = scenes.PALM * (samples.c_n[:, k] - problem.epsilon) - np.abs(
+                    samples.c_t[:, k]
+                )
                 assert grip.min() > -SLACK
                 slip = measure_slip(stage.formation, samples.z, samples.z_dot)
                 assert np.abs(slip[:, k]).max() < 1e-12
@@ -170,8 +156,8 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
 ) -> None:
     """Its three features follow in one motion, and an impact that leaves the tip."""
     monkeypatch.setattr("wholearm.planning.plan._find_saving", lambda *_: np.nan)
-    whole = build_problem(tomllib.loads(LYING))
-    passing = part_of(whole, 3)
+    whole = build_problem(tomllib.loads(scenes.LYING))
+    passing = shipped.part_of(whole, 3)
     options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
     along = solve(passing, **options)
     within = solve(passing, transcription="time", time_intervals=4, **options)
@@ -184,7 +170,7 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
 
 def test_contacts_that_reverse_at_one_place_do_not_stop_the_motion() -> None:
     """On the square both fingers reverse halfway, by symmetry."""
-    halfway = part_of(problem_of(SQUARE), 1, 2)
+    halfway = shipped.part_of(shipped.problem_of(shipped.SQUARE), 1, 2)
     options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
     along, within = solve(halfway, **options), solve(halfway, transcription="time", **options)
     assert within.duration == pytest.approx(along.duration, rel=2e-3)  # errors of both
@@ -192,7 +178,13 @@ def test_contacts_that_reverse_at_one_place_do_not_stop_the_motion() -> None:
 
 
 @pytest.mark.parametrize(
-    "throw, name", [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")]
+    "throw, name",
+    [
+        (scenes.shove, "radau"),
+        (scenes.heave, "radau"),
+        (scenes.heave, "legendre"),
+        (scenes.lift, "radau"),
+    ],
 )
 def test_what_moves_by_itself_takes_its_time(
     throw: Callable[[], tuple[Problem, float]], name: str
@@ -202,16 +194,16 @@ def test_what_moves_by_itself_takes_its_time(
         plan = solve(problem, scheme=name, **THROWN).trajectory
     # One or two contacts are left, and with them four or three freedoms.
     formation = problem.phases[1].formation
-    assert formation.n_constraints == 2 - (throw is lift)
+    assert formation.n_constraints == 2 - (throw is scenes.lift)
     # Collocation misses a falling body by powers of an eighth of its time; a sliding one, whose
     # acceleration is constant, not at all.
-    accuracy = 1e-12 if throw is shove else 2e-8
+    accuracy = 1e-12 if throw is scenes.shove else 2e-8
     assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=accuracy)
     assert verify(problem, plan, uniqueness_margin=ANY).ok
     motion = plan.motions[1]
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
     y, phi = samples.z[:, 1], samples.z[:, 2]
-    if throw is shove:
+    if throw is scenes.shove:
         # Weight and friction, whose moment the two forces share: closed form.
         weight = problem.scene.polygon.mass * 9.81
         lean = 0.3 * 0.03 / 0.06
@@ -225,12 +217,12 @@ def test_what_moves_by_itself_takes_its_time(
         energy = kinetic + body.mass * 9.81 * y
         # Nothing takes energy away; the potential energy changes by millijoules.
         assert np.ptp(energy) < 1e-7
-        if throw is lift:
+        if throw is scenes.lift:
             np.testing.assert_allclose(rates[:, 0], 0.0, atol=1e-7)
         assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
 
 
-@pytest.mark.parametrize("throw, objective", [(shove, "margin"), (heave, "effort")])
+@pytest.mark.parametrize("throw, objective", [(scenes.shove, "margin"), (scenes.heave, "effort")])
 def test_one_and_two_contacts_are_planned_for_every_objective(
     throw: Callable[[], tuple[Problem, float]], objective: str
 ) -> None:
@@ -292,7 +284,7 @@ def test_little_less_friction_takes_little_more_time() -> None:
     """The landing with friction 0.06 is that with 0.07, continued: no limit of it is far."""
     lasts = []
     for friction in (0.07, 0.06):
-        problem = part_of(problem_of(HEPTAGON).with_(friction=friction), 4)
+        problem = shipped.part_of(shipped.problem_of(shipped.HEPTAGON).with_(friction=friction), 4)
         given = problem, problem.phases, problem.start, PlanOptions()
         lasts.append(total(plan_phases(*given, only_begin=True)))
     assert lasts[1] == pytest.approx(lasts[0], rel=0.03)
@@ -308,7 +300,7 @@ def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion
 
 
 def test_the_value_of_a_margin_is_the_least_force() -> None:
-    problem, allowed, options = raised(), 0.07, PlanOptions("margin", time_intervals=COARSE)
+    problem, allowed, options = scenes.raised(), 0.07, PlanOptions("margin", time_intervals=COARSE)
     plans = plan_phases(problem, problem.phases, problem.start, options, allowed)
     # With more time it would be larger.
     assert total(plans) == pytest.approx(allowed, rel=1e-8)
@@ -334,7 +326,7 @@ def test_values_are_times_and_efforts_and_the_effort_of_a_gentle_plan_is_least()
 
 def test_plans_are_the_same_every_time() -> None:
     """Nothing is left of what was planned before, nor of what was planned in between."""
-    (problem, _), (other, _) = shove(), heave()
+    (problem, _), (other, _) = scenes.shove(), scenes.heave()
     plans = [
         plan_phases(each, each.phases, each.start, PlanOptions(time_intervals=COARSE))
         for each in (problem, other, problem)
@@ -398,7 +390,7 @@ PARTS = {"time": (0, 2), "effort": (1, 4)}
 
 @cache
 def problem(objective: str) -> Problem:
-    part = part_of(problem_of(IMPACTS), *PARTS[objective])
+    part = shipped.part_of(shipped.problem_of(shipped.IMPACTS), *PARTS[objective])
     *moving, last = part.phases
     return replace(part, phases=(*moving, replace(last, end=End.REST)))
 
@@ -419,6 +411,31 @@ def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
     """The last sample of a phase and the first one of the next."""
     before, after = trajectory.motions[phase], trajectory.motions[phase + 1]
     return before.evaluate(np.array([before.duration])), after.evaluate(np.zeros(1))
+
+
+def plan_again() -> float:
+    own = solve(problem("time"), time_intervals=4, transcription="time", replay=False)
+    return own.value / float(planned("time").meta["value"])
+
+
+def test_an_impact_is_passed_where_no_motion_comes_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(part: PlanPart, bounds: list[int], *others: Any) -> Any:
+        if len(bounds) > 2:
+            raise InfeasibleError("no motion comes to rest")
+        return plan_stops(part, bounds, *others)
+
+    monkeypatch.setattr(time_plan, "plan_stops", stop)
+    assert plan_again() == pytest.approx(1, rel=1e-4)
+
+
+def test_what_fails_near_a_solution_is_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(*args: Any, **options: Any) -> Solver:
+        if options["max_iter"] > ITERATIONS and "mu_strategy" not in options:
+            options["max_iter"] = 1
+        return build_solver(*args, **options)
+
+    monkeypatch.setattr(time_nlp, "build_solver", build)
+    assert plan_again() == pytest.approx(1, rel=1e-4)
 
 
 def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Array:
@@ -464,7 +481,7 @@ def test_transitions_agree_with_those_along_the_curves(objective: str) -> None:
 @pytest.mark.parametrize("objective, over_time", list(product(("time", "effort"), (True, False))))
 def test_velocities_jump_by_the_impact_law(objective: str, over_time: bool) -> None:
     """Over time impacts are solved for, along curves they are known."""
-    plan, own = plan_of(IMPACTS, objective), problem_of(IMPACTS)
+    plan, own = shipped.plan_of(shipped.IMPACTS, objective), shipped.problem_of(shipped.IMPACTS)
     if over_time:
         plan, own = planned(objective), problem(objective)
     metric, close = metric_weights(own.scene), 1e-5 if over_time else 1e-9
@@ -500,7 +517,10 @@ def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
 
 def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     """The heptagon's landing and the phase before it."""
-    part, expected = part_of(landing(), 3), plan_of(LANDING).meta["phase_durations"][3:]
+    part, expected = (
+        shipped.part_of(landing(), 3),
+        shipped.plan_of(shipped.LANDING).meta["phase_durations"][3:],
+    )
     first, *others = part.phases
     one = replace(part, phases=(replace(first, end=End.IMPACT), *others))
     struck = solve(one, time_intervals=4, replay=False)
@@ -515,7 +535,7 @@ def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
 
 @pytest.mark.parametrize("objective", ["time", "effort"])
 def test_it_stops_where_no_impact_is_possible(objective: str) -> None:
-    trajectory = plan_of(IMPACTS, objective)
+    trajectory = shipped.plan_of(shipped.IMPACTS, objective)
     rows = trajectory.meta["transitions"]
     assert [(row["phase"], row["possible"]) for row in rows] == [
         (1, True), (2, True), (3, False), (4, False)
@@ -532,9 +552,9 @@ def test_it_stops_where_no_impact_is_possible(objective: str) -> None:
 
 
 def test_what_an_impact_saves_is_what_a_stop_costs() -> None:
-    meta = plan_of(IMPACTS, "effort").meta
+    meta = shipped.plan_of(shipped.IMPACTS, "effort").meta
     row = meta["transitions"][0]
-    stopping = problem_of(IMPACTS).with_({f"phases[{row['phase']}].end": "rest"})
+    stopping = shipped.problem_of(shipped.IMPACTS).with_({f"phases[{row['phase']}].end": "rest"})
     stopped = solve(stopping, "effort", replay=False)
     assert row["saves"] == pytest.approx(stopped.meta["value"] - meta["value"], abs=1e-9)
     assert row["saves"] > 0.01
@@ -542,7 +562,7 @@ def test_what_an_impact_saves_is_what_a_stop_costs() -> None:
 
 def slide(*ends: float) -> Problem:
     """The heptagon slides to x [m] and on to others, joined smoothly."""
-    whole = problem_of(HEPTAGON)
+    whole = shipped.problem_of(shipped.HEPTAGON)
     contacts = whole.table["phases"][0]["contacts"]
     phases = [{"contacts": contacts, "until": {"x": x}, "end": "smooth"} for x in ends]
     return whole.with_({"phases": [*phases[:-1], phases[-1] | {"end": "rest"}]})
@@ -565,13 +585,13 @@ def test_the_links_are_kept_apart_between_points_too() -> None:
     """Left alone, finger 1 would let the other link swing through it."""
     options: dict[str, Any] = {"time_intervals": 8, "replay": False}
     passing, solid = (
-        solve(make_way(solid), "effort", **options).trajectory for solid in (False, True)
+        solve(scenes.make_way(solid), "effort", **options).trajectory for solid in (False, True)
     )
-    scene, least = make_way(solid=True).scene, []
+    scene, least = scenes.make_way(solid=True).scene, []
     for plan in (passing, solid):
         (motion,) = plan.motions
         z = motion.evaluate(np.linspace(0.0, motion.duration, 4001)).z
-        least.append(float(measure_fingers(scene, z).min()))
+        least.append(float(scenes.measure_fingers(scene, z).min()))
         for k in (0, 1):
             assert finger_gap(scene, z[::20, :3], k, z[::20, 3 + k]).min() > -2e-8
     assert least[0] < -5e-3 and least[1] > -2e-8
@@ -582,7 +602,7 @@ def test_the_links_are_kept_apart_between_points_too() -> None:
 def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem, options = raised(), PlanOptions(time_intervals=6)
+    problem, options = scenes.raised(), PlanOptions(time_intervals=6)
 
     def guess_wrong(*given: object, **named: object) -> list[Stage]:
         stages = guess_stages(*given, **named)  # type: ignore[arg-type]
@@ -601,9 +621,9 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
 
 def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     """Rolling throughout is one of its motions, with one freedom: the bound is along a curve."""
-    problem = tilting()
+    problem = scenes.tilting()
     (phase,) = problem.phases
-    rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
+    rolls = replace(phase, formation=scenes.roll(phase.formation, "v1-palm"))
     bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False)
     plan = solve(problem, time_intervals=6, replay=False)
     assert plan.duration < 0.95 * bound.duration
@@ -611,9 +631,9 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
 
 
 def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
-    sliding = tilting()
+    sliding = scenes.tilting()
     (phase,) = sliding.phases
-    rolling = roll(phase.formation, "v1-palm")
+    rolling = scenes.roll(phase.formation, "v1-palm")
     first = replace(phase, until=Until(), end=End.SMOOTH)
     last = replace(phase, index=1, formation=rolling)
     problem = replace(sliding, phases=(first, last))
@@ -669,7 +689,7 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
 
 
 def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:
-    problem = problem_of(HEPTAGON)
+    problem = shipped.problem_of(shipped.HEPTAGON)
     x, phi = trace_phases(problem)[0].end[[0, 2]].tolist()
     same = pin(problem, 0, ("x", x), ("phi", phi))
     assert trace_phases(same)[0].end.tolist() == trace_phases(problem)[0].end.tolist()
@@ -696,7 +716,7 @@ def test_another_place_than_the_one_pinned_fails() -> None:
 
 def test_a_vertex_in_a_corner_may_go_back_first() -> None:
     """The triangle turns about a vertex in the corner of palm and link, which first goes back."""
-    table = dict(read_problem(str(FOLDER / "triangle.toml")).table)
+    table = dict(read_problem(str(shipped.FOLDER / "triangle.toml")).table)
     turn = {"contacts": ["v1-palm", "v1-finger1", "v0-finger2"], "until": "v2-finger1"}
     problem = build_problem({**table, "phases": [table["phases"][0], turn]})
     phase = problem.phases[1]
@@ -708,7 +728,7 @@ def test_a_vertex_in_a_corner_may_go_back_first() -> None:
 
 
 def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
-    coarse, fine = plan_landing(time_intervals=COARSE), plan_of(LANDING).meta
+    coarse, fine = plan_landing(time_intervals=COARSE), shipped.plan_of(shipped.LANDING).meta
     lost = total(coarse) / sum(fine["phase_durations"][4:]) - 1
     error = fine["phase_errors"][4]
     assert error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
@@ -766,8 +786,8 @@ def test_the_least_over_a_polygon_is_that_of_a_solver(square: float) -> None:
 
 def test_small_turns_take_the_root_of_their_angle() -> None:
     """Bang-bang acceleration over short ways, whose ends are less than a milliradian off."""
-    start = math.degrees(tipping().start[2])
+    start = math.degrees(shipped.tipping().start[2])
     angles = np.array([1e-4, 5e-4])
-    problems = [tipping(start + math.degrees(angle)) for angle in angles]
+    problems = [shipped.tipping(start + math.degrees(angle)) for angle in angles]
     times = [solve(problem, time_intervals=10).value for problem in problems]
     assert times[1] / times[0] == pytest.approx(math.sqrt(angles[1] / angles[0]), rel=0.01)

@@ -9,19 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+import plane
 import shipped
-from plane import (
-    SQUARE,
-    convex_polygon,
-    find_null_vector,
-    finger_gap,
-    make_formation,
-    make_scene,
-    measure_gaps,
-    place_corners,
-    place_tips,
-    rotate,
-)
 from scenes import hexagon, measure_fingers, roll, tip
 from shipped import problem_of
 from toys import plan_path
@@ -48,7 +37,7 @@ def make_problem(scene: Scene, flush: int, x: float, *phases: tuple[str, Any]) -
 @pytest.fixture(scope="module")
 def stationary(heptagon: Problem) -> Curve:
     """A flip during which joint 1 stops and turns back: P_AI is singular there."""
-    scene = make_scene(np.asarray(heptagon.scene.polygon.points), base=0.12, length=0.25)
+    scene = plane.make_scene(np.asarray(heptagon.scene.polygon.points), base=0.12, length=0.25)
     scene = replace(scene, fingers_collide=False)
     slide = "v1-palm v2-palm v4-finger1 v6-finger2", "v0-finger2"
     flip = "v1-palm v4-finger1 v0-finger2 v6-finger2", "v3-finger1"
@@ -62,7 +51,7 @@ def every_curve(curves: tuple[Curve, ...], stationary: Curve) -> tuple[Curve, ..
 
 def unit_tangent(formation: Formation, z: Array) -> Array:
     """Null vector of A by its signed minors, of length 1 in the metric of arc length."""
-    null = find_null_vector(formation.evaluate(z[None], z[None]).A[0])
+    null = plane.find_null_vector(formation.evaluate(z[None], z[None]).A[0])
     return np.asarray(null / np.sqrt(null**2 @ metric_weights(formation.scene)))
 
 
@@ -75,8 +64,8 @@ def test_a_box_tips_about_the_vertex_that_rolls() -> None:
     """Its centroid runs on a circle, and every point of the curve has the vertex in one place."""
     curve = tip()
     z = curve.evaluate(interior(curve, 40)).z
-    corners = place_corners(curve.formation.scene, z)[:, 1]
-    place = place_corners(curve.formation.scene, curve.start)[1]
+    corners = plane.place_corners(curve.formation.scene, z)[:, 1]
+    place = plane.place_corners(curve.formation.scene, curve.start)[1]
     np.testing.assert_allclose(corners, np.broadcast_to(place, corners.shape), atol=1e-13)
     assert np.ptp(z[:, 2]) > 1.4
     assert curve.reached and curve.end[2] == pytest.approx(-np.pi / 2, abs=1e-12)
@@ -86,18 +75,18 @@ def test_a_box_tips_about_the_vertex_that_rolls() -> None:
 
 def test_a_tip_rolls_on_an_edge() -> None:
     """What it goes along the edge is what it turns on its radius, against the object."""
-    scene = make_scene(SQUARE, base=0.08, depth=0.0, lengths=(0.04, 0.15), radius=0.01)
-    q = np.array([0.03, -rotate(-0.2, SQUARE)[:, 1].min(), -0.2])
+    scene = plane.make_scene(plane.SQUARE, base=0.08, depth=0.0, lengths=(0.04, 0.15), radius=0.01)
+    q = np.array([0.03, -plane.rotate(-0.2, plane.SQUARE)[:, 1].min(), -0.2])
     z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
-    formation = roll(make_formation(scene, "v1-palm e1-tip1 v3-finger2"), "e1-tip1")
+    formation = roll(plane.make_formation(scene, "v1-palm e1-tip1 v3-finger2"), "e1-tip1")
     weights = np.sqrt(metric_weights(scene))
     heading = np.linalg.svd(formation.evaluate(z[None], z[None]).P[0] / weights)[2][-1] / weights
     curve = trace_curve(formation, z, heading, NEVER)
     places = np.linspace(0, curve.length, 30)
     z = curve.evaluate(places).z
-    corners = place_corners(scene, z)
+    corners = plane.place_corners(scene, z)
     run = corners[:, 2] - corners[:, 1]
-    tips = place_tips(scene, 0, z[:, 3])
+    tips = plane.place_tips(scene, 0, z[:, 3])
     along = ((tips - corners[:, 1]) * run).sum(axis=1) / np.hypot(*run.T)
     turned = 0.01 * (z[:, 3] - z[:, 2])
     np.testing.assert_allclose(np.diff(along), np.diff(turned), atol=1e-14)
@@ -199,9 +188,9 @@ def check_clear(curve: Curve) -> None:
     scene = curve.formation.scene
     z, z_s = curve.evaluate(np.linspace(0, curve.length, 40))[:2]
     assert np.abs(curve.formation.evaluate(z, z_s).C).max() < 1e-12
-    assert place_corners(scene, z)[..., 1].min() > -1e-12
+    assert plane.place_corners(scene, z)[..., 1].min() > -1e-12
     for finger in (0, 1):
-        assert finger_gap(scene, z[:, :3], finger, z[:, 3 + finger]).min() > -1e-11
+        assert plane.finger_gap(scene, z[:, :3], finger, z[:, 3 + finger]).min() > -1e-11
 
 
 SIDE_REACH = float(np.sqrt(0.1**2 + 0.005**2 - 0.07**2))
@@ -230,7 +219,7 @@ def test_early_ending_says_what_and_where(
     length: float, contact: str, goal: float, text: str, x: float
 ) -> None:
     """A square slides on the palm; where it must stop is worked out by hand."""
-    scene = replace(make_scene(SQUARE, lengths=(length, 0.25)), fingers_collide=False)
+    scene = replace(plane.make_scene(plane.SQUARE, lengths=(length, 0.25)), fingers_collide=False)
     problem = make_problem(scene, 0, 0.0, (f"{LEFT_V3} {contact}", {"x": goal}))
     with pytest.raises(InputError) as caught:
         trace_phases(problem)
@@ -256,12 +245,12 @@ def test_a_tip_is_reached_and_gone_round(
     length: float, contact: str, until: str, follower: str
 ) -> None:
     """From the side or an edge onto the tip's arc, and on until the arc ends."""
-    scene = replace(make_scene(SQUARE, lengths=(length, 0.25)), fingers_collide=False)
+    scene = replace(plane.make_scene(plane.SQUARE, lengths=(length, 0.25)), fingers_collide=False)
     problem = make_problem(scene, 0, 0.0, (f"{LEFT_V3} {contact}", until))
     (first,) = trace_phases(problem)
     assert (first.reached and until in first.ending) or "runs off" in first.ending
     names = f"{LEFT_V3} {until}"
-    second = make_formation(scene, names)
+    second = plane.make_formation(scene, names)
     assert set(second.contacts) <= set(find_touching(scene, first.end))
     onward = first.evaluate(np.array([first.length])).z_s[0]
     assert follower in trace_curve(second, first.end, onward, NEVER).ending
@@ -274,9 +263,9 @@ def test_random_hands_give_valid_curves(seed: int) -> None:
     traced = 0
     for _ in range(6):
         lengths = rng.uniform(0.06, 0.25), rng.uniform(0.06, 0.25)
-        points = convex_polygon(rng, int(rng.integers(3, 8)))
+        points = plane.convex_polygon(rng, int(rng.integers(3, 8)))
         radius = float(rng.choice([0.0, 0.004, 0.012]))
-        scene = make_scene(points, lengths=lengths, radius=radius, base=0.11, depth=-0.015)
+        scene = plane.make_scene(points, lengths=lengths, radius=radius, base=0.11, depth=-0.015)
         q = place_flush(scene, int(rng.integers(len(points))), rng.uniform(-0.04, 0.04))
         try:
             z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
@@ -367,7 +356,7 @@ def test_outlines_are_closed_at_every_point_and_end_where_their_phase_does(
     for phase, parts in zip(flipping.phases, outlines, strict=True):
         for part in parts:
             assert len(part.z) == POINTS
-            assert np.abs(measure_gaps(part.formation, part.z)).max() < CLOSED
+            assert np.abs(plane.measure_gaps(part.formation, part.z)).max() < CLOSED
             assert part.formation.evaluate_limits(part.z).min() > -CLOSED
         if not phase.until.is_release:
             end = parts[-1].z[-1:]
@@ -390,7 +379,7 @@ def test_phases_that_cannot_be_are_named(
 ) -> None:
     if isinstance(until, str):
         until = Until(parse_contact(until, flipping.scene))
-    phase = Phase(5, make_formation(flipping.scene, names), until)
+    phase = Phase(5, plane.make_formation(flipping.scene, names), until)
     if reason is None:
         assert guess_phase(phase, released)
         return
@@ -412,13 +401,13 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit() -> None:
     """v0 is lifted until edge 0 is flush on finger 2, while v1 stays on the link's side."""
     problem = problem_of(shipped.HEXAGON)
     start, scene = trace_phases(problem)[4].end, problem.scene
-    formation = make_formation(scene, "v1-palm v3-finger1 v0-finger2")
+    formation = plane.make_formation(scene, "v1-palm v3-finger1 v0-finger2")
     until = parse_contact("v1-finger2", scene)
     ending = Formation(scene, (*formation.contacts, until))
     nearest = close_contacts(ending, start, np.zeros(0))
     assert nearest is not None and ending.evaluate_limits(nearest[None]).min() < -CLOSED
     (part,) = guess_phase(Phase(5, formation, Until(until)), start)
-    assert np.abs(measure_gaps(ending, part.z[-1])).max() < CLOSED
+    assert np.abs(plane.measure_gaps(ending, part.z[-1])).max() < CLOSED
     assert formation.evaluate_limits(part.z).min() > -CLOSED
     # Edge 0 leaves the palm by the angle between finger 2 and the left end of the palm.
     np.testing.assert_allclose(part.z[-1, 2], part.z[-1, 4] - np.pi, atol=1e-9)
