@@ -38,7 +38,9 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights
 from wholearm.mechanics.impact import compute_impact
+from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.nlp import Solver, build_solver
+from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_nlp, time_plan
@@ -436,6 +438,17 @@ def test_what_fails_near_a_solution_is_solved_again(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(time_nlp, "build_solver", build)
     assert plan_again() == pytest.approx(1, rel=1e-4)
+
+
+def test_a_part_of_a_block_starts_at_rest() -> None:
+    """Although the plan of the whole block, its guess, passes there at speed."""
+    own, options = problem("time"), PlanOptions(time_intervals=4)
+    curves = ImpactSequence(own.phases, trace_phases(own)).continuous_curves
+    first, free = plan_curves(curves, own.epsilon, options, (1, 2))
+    assert np.abs(free.motion.evaluate(np.zeros(1)).z_dot).max() > 0.1
+    z = first.motion.evaluate(np.array([first.motion.duration])).z[0]
+    (part,) = plan_phases(own, own.phases[1:], z, options, free=[free])
+    assert np.abs(part.motion.evaluate(np.zeros(1)).z_dot).max() < 1e-9
 
 
 def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Array:

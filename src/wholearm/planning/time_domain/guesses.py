@@ -68,6 +68,17 @@ class Guess(NamedTuple):
         """The same with a given end, shape (5,)."""
         return self._replace(stages=[replace(stage, stop=z) for stage in self.stages])
 
+    def from_rest(self) -> Guess:
+        """The same with a start at rest: plans of a block without stops pass there at speed."""
+        first, *others = self.stages
+        if not first.guess.nodes[0, 1].any():
+            return self
+        nodes = first.guess.nodes.copy()
+        nodes[0, 1] = 0.0
+        return self._replace(
+            stages=[replace(first, guess=first.guess._replace(nodes=nodes)), *others]
+        )
+
     def by_homotopy(self) -> Guess:
         """The same path, in the modes of the friction homotopy."""
         name = f"{self.name} with friction that sets in gradually"

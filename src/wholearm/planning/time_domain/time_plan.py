@@ -113,7 +113,7 @@ def plan_phases(
 
     explanation = replan if thorough else None
     if solution is None and free:
-        guess = guesses.along(free)
+        guess = guesses.along(free).from_rest()
         if problem.scene.has_slow_motors or problem.scene.control_period:
             solution = change_torques(search, guess, stages if pinned else [])
         else:
