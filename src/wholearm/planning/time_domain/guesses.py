@@ -71,7 +71,7 @@ class Guess(NamedTuple):
     def from_rest(self) -> Guess:
         """The same with a start at rest: plans of a block without stops pass there at speed."""
         first, *others = self.stages
-        if not first.guess.nodes[0, 1].any():
+        if np.abs(first.guess.nodes[0, 1]).max() < 1e-9:  # rounding
             return self
         nodes = first.guess.nodes.copy()
         nodes[0, 1] = 0.0

@@ -655,26 +655,24 @@ def plan_with_impacts(
         return with_stops(options, duration)
     # A duration that is too short for stops need not be so without them.
     fast = replace(options, objective=Objective.TIME, duration=None)
-    stopped, reason, blocked = None, None, list[int]()
+
+    def pass_others(blocked: Sequence[int]) -> Plans:
+        direct = plan_parts_of(problem, block, ample, free)
+        return plan_stops(direct, [0, *blocked, len(block)], z, options, duration)
+
     try:
         stopped = with_stops(options if duration is None else fast)
-    except (InfeasibleError, SolverError) as error:
+    except (InfeasibleError, SolverError):
         # No motion may come to rest where one passes at speed: phase 3 of new polygon 22.
-        reason = error
-    else:
-        blocked = [
-            k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
-        ]
+        with suppress(InfeasibleError, SolverError):
+            return pass_others([])
+        raise
+    blocked = [
+        k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
+    ]
     if len(blocked) < len(ends):
-        bounds = [0, *blocked, len(block)]
-        try:
-            direct = plan_parts_of(problem, block, ample, free)
-            return plan_stops(direct, bounds, z, options, duration)
-        except (InfeasibleError, SolverError):
-            pass
-    if stopped is None:
-        assert reason is not None
-        raise reason
+        with suppress(InfeasibleError, SolverError):
+            return pass_others(blocked)
     return stopped if duration is None else with_stops(options, duration)
 
 
