@@ -364,7 +364,8 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     assert main(command) == 1
     said = capsys.readouterr().err
     assert "no policy is written" in said and "phase 2, and opens by" in said
-    tried = "--period 0.0002 --delay 0, --reserve 1.25, a plan with epsilon = 0.4 N"
+    tried = "--contact-speed 0.5, --contact-speed 0.25, --period 0.0002 --delay 0, --reserve 1.25"
+    tried += ", a plan with epsilon = 0.4 N"
     assert f"{tried} would not do either; --write-anyway" in said
     assert not output.exists()
     assert main([*command, "--write-anyway"]) == 0

@@ -878,7 +878,7 @@ def _replay(options: argparse.Namespace) -> int:
 def _policy(options: argparse.Namespace) -> int:
     from ..policy.make import find_widest
     from ..problem.read import read_own_problem
-    from ..verification.free import find_policy
+    from ..verification.free import CONTACT_SPEEDS, find_policy
 
     output = options.output or f"{Path(options.plan).stem}_policy.npz"
     require_output(output, ".npz")
@@ -909,7 +909,10 @@ def _policy(options: argparse.Namespace) -> int:
                 tried = plan if scene is problem else plan_anew(scene)
                 if find_policy(scene, tried, **({"contact_speed": 1.0} | values | changes))[1].ok:
                     return f"{words} would do"
-        return f"{', '.join(words for words, *_ in trials)} would not do either"
+        speeds = () if "contact_speed" in values else CONTACT_SPEEDS[1:]
+        texts = [f"--contact-speed {speed:g}" for speed in speeds]
+        texts += [words for words, *_ in trials]
+        return f"{', '.join(texts)} would not do either"
 
     with name_source(options.plan):
         say("making and simulating the policy")
