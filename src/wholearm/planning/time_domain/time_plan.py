@@ -376,7 +376,9 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
 
     def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
-        most = 150 if equal else 80  # phases 2 to 4 of a pentagon take 70 at 2 ms
+        # Phases 2 to 4 of a pentagon take 70 at 2 ms. More than from a guess, so that a solve that
+        # fails is made again: queries 38 and 45 at 2 ms.
+        most = 150 if equal else 80
         return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=most)
 
     def hold(period: float, most: int) -> TimeSolution | None:
