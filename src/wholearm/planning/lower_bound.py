@@ -187,8 +187,8 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     motion = speed_sweep(limits, steps, (path.place(angles) - ends[:-1]) / steps, cap)
     # Where segments meet, on both sides.
     lasts = np.flatnonzero(np.diff(grid.owners))
-    turns, sides = np.repeat(lasts + 1, 2), np.stack([lasts, lasts + 1], axis=1).ravel()
-    at_turns = path.evaluate(grid.angles[turns, None], grid.owners[sides]).pick((slice(None), 0))
+    turns, both = np.repeat(lasts + 1, 2), np.stack([lasts, lasts + 1], axis=1).ravel()
+    at_turns = path.evaluate(grid.angles[turns, None], grid.owners[both]).pick((slice(None), 0))
     slack = at_turns.at(motion.b[turns] * np.linspace(0.0, 1.0, 5)[:, None])
     least, most = find_range(at_turns.rows[..., A], slack + _SHORT)
     if (slow := (least > most).all(axis=0)).any():
