@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
+from wholearm.mechanics.limits import force_limit_rows
 from wholearm.policy import make, regulator
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
@@ -380,6 +382,21 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
     torque = TorqueProfile(np.array([0.0, 0.05]), tau[None, :, None])
     held = simulate_free(own, torque)
     assert held.z[-1] == pytest.approx(own.start, abs=1e-9)
+
+
+def test_a_contact_that_rolls_does_not_slip_at_another_speed() -> None:
+    flip = {"contacts": ["v1-palm", "v3-finger1", "v0-finger2"]}
+    flip["until"] = {"contact": "v1-finger2", "x": -0.08567}
+    problem = problem_of(HEXAGON).with_({"x": -0.07004, "phases": [flip]})
+    plan = wholearm.solve(problem, replay=False).trajectory
+    stretches = regulator.split_modes(problem.phases[0], plan, np.linspace(0, plan.duration, 30))
+    rolling = [part for part in stretches if part.formation.rolling]
+    assert rolling
+    for part, b in product(rolling, (1.0, 0.5)):
+        _, c, tau = part.scale(b)
+        # With the internal force of the plan |c_t| is 2.2 mu c_n at half of its squared speed.
+        assert (force_limit_rows(part.formation) @ c.T).min() > 0.0
+        assert np.abs(tau).max() < 2.0 + 1e-6
 
 
 def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:

@@ -45,9 +45,9 @@ from ..problem.definition import GROUPS, PARAMETERS, End, Phase, Problem, change
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .curve_law import LoopSettings, choose_internal_force
+from .curve_law import LoopSettings
 from .playback import Policy
-from .regulator import STILL, Planner, hold_end, replan, tabulate_motion
+from .regulator import STILL, Planner, find_internal_force, hold_end, replan, tabulate_motion
 
 COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
 PathMotion = tuple[Array, Array, Array]  # a, b and internal force at n places
@@ -202,14 +202,6 @@ def leave_one(levels: Array) -> Array:
         twice = (distinct_levels[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
         distinct_levels[twice, :, k] = UNLIMITED
     return distinct_levels
-
-
-def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
-    """The internal force with the largest least level for a motion, shape (n,)."""
-    levels = rows.levels
-    base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
-    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
-    return np.array([choose_internal_force(one, [0.0] * len(one), by, 0.0)[1] for one, by in pairs])
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
@@ -382,7 +374,7 @@ class ReferencePiece(NamedTuple):
         a = np.diff(self.b) / (2 * np.diff(rows.s))
         a = np.append(a, a[-1])
         count = len(split_limits(self.curve.formation)[0].low)
-        motion = stack_motion(a, self.b, find_internal_force(rows, a, self.b))
+        motion = stack_motion(a, self.b, find_internal_force(rows.levels, a, self.b)[1])
         levels = np.einsum("nmi,ni->nm", rows.levels[:, : rows.presses], motion)
         least = levels.min(axis=0).reshape(-1, count).min(axis=0)
         return dict(zip(names, least[: len(names)].tolist(), strict=True))
@@ -466,7 +458,7 @@ def _trace(
         motion = factor * a, factor * b
         rows = find_rows((*motion, internal))
         for _ in range(2 if factor < 1.0 else 0):
-            rows = find_rows((*motion, find_internal_force(rows, *motion)))
+            rows = find_rows((*motion, find_internal_force(rows.levels, *motion)[1]))
         wanted = size * rows.unit
         wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
         controllable_set = retime(s, rows.slack, wanted, motion[1], end)
@@ -550,7 +542,7 @@ def retime_within(
             if controllable_set.share.min() < 0.5:
                 return None
             a = np.gradient(b, s) / 2
-            motion = a, b, find_internal_force(rows, a, b)
+            motion = a, b, find_internal_force(rows.levels, a, b)[1]
         return within.at(motion)[0], controllable_set
 
     low, high, best = 0.0, 1.0, find(1.0)

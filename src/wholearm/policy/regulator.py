@@ -30,12 +30,16 @@ from ..mechanics.dynamics import (
     build_forward,
     inverse,
     metric_weights,
+    stack_motion,
 )
+from ..mechanics.limits import SPEED, TORQUE, make_limits
+from ..mechanics.path_limits import find_slack_rows
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
 from ..simulation.modes import find_hold, find_standstill
+from .curve_law import choose_internal_force
 
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
 APPROACH = 4.0  # joint speed beyond the end, over that which counts as none
@@ -75,15 +79,36 @@ class RegulatedStretch(NamedTuple):
     z_dot: Array
     directions: Directions
     forces: PathForces  # with time as the path parameter
-    internal: Array  # internal force of the plan
+    levels: Array  # (n, m, 5): limits over their margins, coefficients as of `forces`
 
-    def find_forces(self, b: float) -> Array:
-        """Contact forces of the plan with its squared speed times `b`, (n, n_c + R) [N]."""
-        return self.forces.c(np.zeros(len(self.z)), np.full(len(self.z), b), self.internal)
+    def scale(self, b: float) -> tuple[float, Array, Array]:
+        """The plan with its squared speed times `b`, with the best internal force.
 
-    def find_torques(self, b: float) -> Array:
-        """Torques of the same, shape (n, 2) [N m]."""
-        return self.forces.tau(np.zeros(len(self.z)), np.full(len(self.z), b), self.internal)
+        Where a contact rolls that of the plan would let it slip at another speed. Case: query 1,
+        phase 5.
+
+        Returns
+        -------
+        level : float  least of the limits over their margins
+        c : (n, n_c + R) [N]
+        tau : (n, 2) [N m]
+        """
+        zero, b_of_all = np.zeros(len(self.z)), np.full(len(self.z), b)
+        level, internal = find_internal_force(self.levels, zero, b_of_all)
+        motion = zero, b_of_all, internal
+        return float(level.min()), self.forces.c(*motion), self.forces.tau(*motion)
+
+
+def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """The largest least level for a motion, and the internal force that has it, shape (n,).
+
+    `levels`, (n, m, 5), are limits over their margins, linear in (1, a, b, s', internal force).
+    """
+    base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
+    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
+    best = [choose_internal_force(one, [0.0] * len(one), by, 0.0) for one, by in pairs]
+    level, internal = np.array(best).T
+    return level, internal
 
 
 def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
@@ -106,35 +131,33 @@ def follow(
     slow : bool  whether the last torques press all contacts in a slow motion
     """
     starts, t = plan.phase_starts, end_within(phases, plan, t)
-    step, scene = float(t[1] - t[0]), problem.scene
+    step = float(t[1] - t[0])
 
     def divide(t: Array) -> list[RegulatedStretch]:
         owner = np.searchsorted(starts, t, side="right") - 1
         owner = owner.clip(phases[0].index, phases[-1].index)
-        return [part for phase in phases for part in _divide(phase, plan, t[owner == phase.index])]
+        return [part for phase in phases for part in split_modes(phase, plan, t[owner == phase.index])]
 
     parts = divide(t)
-    unit, limit = PRESS * scene.scales.force, scene.torque_limit
 
     def find_margin(b: float) -> float:
-        forces = [part.find_forces(b)[:, : part.formation.n_contacts].min() for part in parts]
-        loads = [(np.abs(part.find_torques(b)) / limit).max() for part in parts]
-        return float(min(min(forces) / unit, (1 - max(loads)) / ROOM))
+        return min(part.scale(b)[0] for part in parts)
 
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     # Mean torques of a period have the plan's impulse, also where it steps.
     within = np.clip(t[:, None] + step * (np.arange(8) - 3.5) / 8, t[0], t[-1]).ravel()
-    torques = np.concatenate([part.find_torques(b) for part in divide(within)])
+    torques = np.concatenate([part.scale(b)[2] for part in divide(within)])
     tau = torques.reshape(-1, 8, 2).mean(axis=1)
     # Beyond the end the motion goes on slowly, where that presses all contacts.
-    slow = parts[-1].find_forces(0.0)[-1, : parts[-1].formation.n_contacts].min() > 0.0
+    _, c, still = parts[-1].scale(0.0)
+    slow = c[-1, : parts[-1].formation.n_contacts].min() > 0.0
     if slow:
-        tau[-1] = parts[-1].find_torques(0.0)[-1]
+        tau[-1] = still[-1]
     return b, tau, regulate(linearizations, step / np.sqrt(b)), bool(slow)
 
 
-def _divide(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
+def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
     """Stretches with constant contact modes at instants of a phase of a plan."""
     spans, names = list_modes(phase, plan), phase.formation.names
     begins = [span["start"] for span in spans[1:]]
@@ -158,12 +181,15 @@ def _stretch(formation: Formation, signs: Array, plan: Trajectory, t: Array) -> 
     z, v = samples.z, samples.z_dot
     directions = Directions(*np.split(np.tile(signs, (len(t), 1)), [formation.n_contacts], axis=1))
     forward = Batch(build_forward(formation))
-    acceleration, c, _ = forward(z, v, plan.torque.at(t), *directions)
+    acceleration, _, _ = forward(z, v, plan.torque.at(t), *directions)
     kinematics = formation.evaluate(z, v)
     forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
-    # The other parts of the forces are orthogonal to that of the internal force.
-    internal = np.einsum("ni,ni->n", c[..., 0], forces.of_c[..., LAMBDA])
-    return RegulatedStretch(formation, z, v, directions, forces, internal)
+    limits = make_limits(formation, 0.0).without(SPEED)
+    weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
+    torque = np.isin(limits.sides[0], limits.of(TORQUE))
+    margins = np.where(torque, ROOM, PRESS * weights)
+    levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
+    return RegulatedStretch(formation, z, v, directions, forces, levels)
 
 
 def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
@@ -181,7 +207,7 @@ def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
 def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
     """Linearization of a part of a plan at a squared speed `b` over the plan's, by differences."""
     formation, scales, n = part.formation, problem.scene.scales, len(part.z)
-    z, v, tau = part.z, part.z_dot * np.sqrt(b), part.find_torques(b)
+    z, v, (_, _, tau) = part.z, part.z_dot * np.sqrt(b), part.scale(b)
     (Xi, sigma), kinematics = part.directions, formation.evaluate(z, v)
     forward, step = Batch(build_forward(formation)), 1e-6
 
