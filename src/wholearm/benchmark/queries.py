@@ -30,10 +30,9 @@ from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..common.fields import choice
 from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
-from ..planning.plan import solve
+from ..planning.plan import plan_anew, solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
-from ..results.trajectory import Trajectory
 from ..search.find_route import Answer, find_route, forget_roadmaps
 from ..verification.free import find_policy
 from ..verification.verify import verify
@@ -144,9 +143,6 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
         "period": {"control_period": 2e-3},
         "dwell": {"settle": "10 %"},
     }
-
-    def plan_anew(problem: Problem) -> Trajectory:
-        return solve(problem, replay=False).trajectory
 
     for way in dict.fromkeys(["printed", *ways]):
         started = time.process_time()

@@ -876,6 +876,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _policy(options: argparse.Namespace) -> int:
+    from ..planning.plan import plan_anew
     from ..policy.make import find_widest
     from ..problem.read import read_own_problem
     from ..verification.free import CONTACT_SPEEDS, find_policy
@@ -886,11 +887,9 @@ def _policy(options: argparse.Namespace) -> int:
     problem = read_own_problem(plan.meta, options.plan)
     say = show_progress()
 
-    def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
-        return wholearm.solve(own, replay=False, progress=say).trajectory
-
+    planner = partial(plan_anew, progress=say)
     names = "reserve", "period", "delay", "torque_limit", "contact_speed", "departure"
-    values = list_given(options, *names) | {"planner": plan_anew}
+    values = list_given(options, *names) | {"planner": planner}
 
     def advise() -> str:
         """Which of a faster loop, half the reserve, and more force would do."""
@@ -906,7 +905,7 @@ def _policy(options: argparse.Namespace) -> int:
         for words, scene, changes in trials:
             say(f"trying {words}")
             with suppress(WholearmError):
-                tried = plan if scene is problem else plan_anew(scene)
+                tried = plan if scene is problem else planner(scene)
                 if find_policy(scene, tried, **({"contact_speed": 1.0} | values | changes))[1].ok:
                     return f"{words} would do"
         speeds = () if "contact_speed" in values else CONTACT_SPEEDS[1:]

@@ -79,6 +79,14 @@ def solve(
     return solve_with(problem, PlanOptions(objective=objective, **options), progress, time_limit)
 
 
+def plan_anew(problem: Problem, progress: Callable[[str], None] | None = None) -> Trajectory:
+    """The plan of a problem for a policy: not replayed, and without advice where there is none."""
+    from .explain import unadvised
+
+    with unadvised():
+        return solve(problem, progress=progress, replay=False).trajectory
+
+
 @exclusive
 def solve_with(
     problem: Problem,

@@ -56,8 +56,8 @@ DAMPING = 0.3  # of the inverse of Theta, which is 1 where the joints alone move
 PRESS, ROOM = 0.6, 0.1
 # Where a release has a place of the planner's choice, the policy stops for it, at such a share of
 # the way to the block's end, or does not stop, and keeps such a share of the margin: the first that
-# has a plan. Case: heptagon, where the released v3 touches finger 1 again.
-STOPS = ((0.8, 1.0), (0.5, 1.0), (None, 1.0), (None, 0.5), (None, 0.25))
+# has a plan. Cases: heptagon, where the released v3 touches finger 1 again; query 18 for the last.
+STOPS = ((0.8, 1.0), (0.5, 1.0), (None, 1.0), (None, 0.5), (None, 0.25), (None, 0.125))
 
 
 class Linear(NamedTuple):
@@ -136,7 +136,9 @@ def follow(
     def divide(t: Array) -> list[RegulatedStretch]:
         owner = np.searchsorted(starts, t, side="right") - 1
         owner = owner.clip(phases[0].index, phases[-1].index)
-        return [part for phase in phases for part in split_modes(phase, plan, t[owner == phase.index])]
+        return [
+            part for phase in phases for part in split_modes(phase, plan, t[owner == phase.index])
+        ]
 
     parts = divide(t)
 
