@@ -44,9 +44,15 @@ from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_nlp, time_plan
-from wholearm.planning.time_domain.guesses import guess_stages, list_stages
+from wholearm.planning.time_domain.guesses import NEAREST, Guess, guess_stages, list_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.solution import ITERATIONS, SETTINGS, TimeSearch, find_least
+from wholearm.planning.time_domain.solution import (
+    ITERATIONS,
+    SETTINGS,
+    TimeSearch,
+    TimeSolution,
+    find_least,
+)
 from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
@@ -438,6 +444,25 @@ def test_what_fails_near_a_solution_is_solved_again(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(time_nlp, "build_solver", build)
     assert plan_again() == pytest.approx(1, rel=1e-4)
+
+
+def test_a_worse_optimum_than_along_the_curve_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    solve_guesses, names = time_plan.solve_guesses, list[str]()
+
+    def worsen(search: TimeSearch, guesses: Sequence[Guess]) -> TimeSolution | None:
+        names.append(guesses[0].name)
+        solution = solve_guesses(search, guesses)
+        if solution is None or len(names) > 1:
+            return solution
+        return solution._replace(
+            stages=[stage.stretch(1.01) for stage in solution.stages], cost=1.01 * solution.cost
+        )
+
+    monkeypatch.setattr(time_plan, "solve_guesses", worsen)
+    slide = shipped.part_of(shipped.problem_of(shipped.HEPTAGON), 2, 3)
+    whole, expected = solve(slide, transcription="time", replay=False), solve(slide, replay=False)
+    assert names == ["the plan along curves", NEAREST]
+    assert whole.value == pytest.approx(expected.value, rel=1e-3)
 
 
 def test_a_part_of_a_block_starts_at_rest() -> None:

@@ -50,6 +50,7 @@ GIVEN = "the contact modes that the problem gives"
 LONGER = f"{NEAREST}, 4 times as long as a fall over that height"  # two routes are from it
 SURE = 1e-3  # margin above which a motion keeps its limits
 FALLS = 2.0  # guessed duration, over that of a fall over the path's length
+AT_REST = 1e-4  # speed that counts as a stop, in the scene's own units
 BRIEF = 0.05  # least duration of a piece over that of its stage
 MOST = 8  # most pieces of a stage
 _LIGHT = 0.5  # normal forces of an initial guess, over the weight of the object
@@ -67,6 +68,12 @@ class Guess(NamedTuple):
     def end_at(self, z: Array) -> Guess:
         """The same with a given end, shape (5,)."""
         return self._replace(stages=[replace(stage, stop=z) for stage in self.stages])
+
+    @property
+    def rests(self) -> bool:
+        """Whether it is from rest to rest."""
+        ends = self.stages[0].guess.nodes[0, 1], self.stages[-1].guess.nodes[-1, 1]
+        return float(np.abs(ends).max()) < AT_REST
 
     def from_rest(self) -> Guess:
         """The same with a start at rest: plans of a block without stops pass there at speed."""

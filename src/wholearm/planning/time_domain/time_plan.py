@@ -30,7 +30,7 @@ from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
-from .guesses import NEAREST, Guess, Guesses, find_modes, list_stages
+from .guesses import AT_REST, NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
     PATIENCE,
@@ -59,7 +59,6 @@ from .time_motion import TimeMotion, make_phase_motions
 if TYPE_CHECKING:
     from ..explain import Replan
 
-AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 
 
@@ -113,11 +112,14 @@ def plan_phases(
 
     explanation = replan if thorough else None
     if solution is None and free:
-        guess = guesses.along(free).from_rest()
+        guess = guesses.along(free)
         if problem.scene.has_slow_motors or problem.scene.control_period:
-            solution = change_torques(search, guess, stages if pinned else [])
+            solution = change_torques(search, guess.from_rest(), stages if pinned else [])
         else:
-            solution = solve_guesses(search, [guess])
+            solution = solve_guesses(search, [guess.from_rest()])
+            if solution and guess.rests and _takes_longer(search, solution, free):
+                other = solve_guesses(search, [guesses.nearest])
+                solution = other if other and other.cost < solution.cost else solution
     for guess in guesses.list_given() if solution is None else ():
         # One by one: the first may lead to modes in which limits between points leave nothing.
         solution = solution or solve_guesses(search, [guess])
@@ -148,6 +150,18 @@ def plan_phases(
             for plan, other in zip(plans, free, strict=True)
         ]
     return plans
+
+
+def _takes_longer(
+    search: TimeSearch, solution: TimeSolution, free: Sequence[PhasePlan[Motion]]
+) -> bool:
+    """Whether a solution costs 0.1 % more than the plans that it is from: a local optimum.
+
+    Case: a kite (0, 0), (80, 0), (95, 40), (40, 85), (-10, 45) mm, 0.3 kg, of `wholearm new` that
+    turns to edge 1 brakes before its impact, in 0.1600 for 0.1508 s.
+    """
+    cost, known = (sum(p.value for p in plans) for plans in (list_plans(search, solution), free))
+    return search.goal is not Objective.MARGIN and cost > 1.001 * known
 
 
 def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> TimeSolution:
