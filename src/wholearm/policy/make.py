@@ -64,7 +64,9 @@ class ReferenceSettings:
     authority: float = 5.0  # margin of the reference's torques, over those of the law
     near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
-    arrival: float = 6e-3  # time constant of the approach to the end [s]
+    # Time constants of the approach to the end [s]: the second one where no slow motion keeps all
+    # contacts and only braking presses them. Case: new polygon 16, phase 4.
+    arrivals: tuple[float, float] = (6e-3, 2e-3)
     # Time at rest before the next phase begins [s]: contacts that errors open on arrival close
     # meanwhile. Case: heptagon_four_contacts, phase 3, where 12 ms are too short.
     dwell: float = 25e-3
@@ -424,8 +426,12 @@ def _trace(
     widths: Mapping[str, float] | None,
     touch: float,
     after: ReferencePiece | None,
+    brief: bool = False,
 ) -> ReferencePiece:
-    """A phase's curve, and the controllable motions along it that keep margins."""
+    """A phase's curve, and the controllable motions along it that keep margins.
+
+    `brief` is whether the shorter one of `SETTINGS.arrivals` is used.
+    """
     rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
     places, *values = _follow(curve, plan, rows_of_phase)
@@ -440,7 +446,7 @@ def _trace(
         passes = after.begins / float(b[-1]) if impact else 1.0
         end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
     else:
-        b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrival) ** 2)
+        b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrivals[brief]) ** 2)
     if widths is not None and size:
         planned = a, b, internal
         within, share = retime_within(curve, s, planned, widths, problem.epsilon, end)
@@ -470,6 +476,8 @@ def _trace(
             break
     assert best is not None
     rows, controllable_set, share = best
+    if share < 0.0 and end is None and not brief:
+        return _trace(problem, phase, plan, size, widths, touch, after, brief=True)
     # Margins without ranges keep no share of ranges.
     share = share if widths is None else 0.0
     return ReferencePiece(curve, rows, controllable_set, share, begins, passes, b)
