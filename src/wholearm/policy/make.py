@@ -370,6 +370,14 @@ class ReferencePiece(NamedTuple):
         return float(find_duration(self.b, np.diff(self.rows.s)))
 
     @property
+    def presses_at_rest(self) -> bool:
+        """Whether torques of its motion press all contacts with no speed wanted at the start.
+
+        Case without: new polygon 34, phase 10.
+        """
+        return float(find_internal_force(self.rows.levels[:1], np.zeros(1), np.zeros(1))[0][0]) > 0
+
+    @property
     def reserves(self) -> dict[str, float]:
         """Least level of each contact's normal force along the reference."""
         rows, names = self.rows, self.curve.formation.names
@@ -590,10 +598,10 @@ def _follow(
     return s, a, v**2, np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA])
 
 
-def _tabulate_curve(piece: ReferencePiece, push: Array) -> dict[str, Array]:
+def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str, Array]:
     """Arrays of `CurveLaw`; levels, torques and normal forces are at both ends of intervals."""
     rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
-    point, dry = curve.evaluate(rows.s), formation.scene.dry[3:]
+    point = curve.evaluate(rows.s)
     mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
     c_n = inverse(formation, *point[:3], mean, point.kinematics).of_c[:, : formation.n_contacts]
     tables = rows.levels, rows.torque, c_n
@@ -607,8 +615,7 @@ def _tabulate_curve(piece: ReferencePiece, push: Array) -> dict[str, Array]:
         "torque": torque[..., COLUMNS],
         "push": push,
         "passes": np.array([piece.passes]),
-        # Friction of the joints decides on rest where torques are not much larger.
-        "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
+        "keeps": np.array([float(keeps)]),
         "forces": forces[..., COLUMNS],
     }
 
@@ -728,11 +735,15 @@ def make_policy(
         goes_on = False
         for phase, entry in zip(block, entries, strict=True):
             piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
-            push = plan.tau[last]
+            push, hold = plan.tau[last], None
             if not np.isnan(plan.c_n[last]).all():
                 hold = hold_end(problem, phase, piece.curve.end)
                 push = push if hold is None else hold
-            table = _tabulate_curve(piece, push)
+            # Friction of the joints decides on rest where torques are not much larger.
+            keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
+            after = pieces.get(phase.index + 1)
+            keeps |= hold is not None and after is not None and not after.presses_at_rest
+            table = _tabulate_curve(piece, push, keeps)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
