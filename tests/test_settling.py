@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 from independent import balances
 from once import once
 from rows import each
-from shipped import HEPTAGON, part_of, problem_of, solved
+from shipped import HEPTAGON, HEXAGON, part_of, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
 from wholearm.common.arrays import Array
@@ -426,6 +426,19 @@ def test_torques_are_held_from_period_to_period(hold: str, tmp_path: Path) -> No
     assert known.phases[0].unheld == free
     scene = read_own_problem(known.trajectory.meta, path).scene
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
+
+
+def test_a_landing_begins_where_held_torques_have_led() -> None:
+    contacts = ["v0-palm", "v1-palm", "v3-finger1", "v0-finger2"]
+    slide = {"contacts": contacts, "until": {"x": -0.07}}
+    flip = {"contacts": contacts[1:], "until": {"contact": "v1-finger2", "x": -0.08567}}
+    changes = {"x": -0.065, "phases": [slide, flip], "control_period": PERIOD}
+    problem = problem_of(HEXAGON).with_(changes)
+    plan = solve(problem, accuracy=1e-2, mode_search=False, replay=False).trajectory
+    first = plan.torque.cut(0.0, plan.phase_starts[1])
+    end = simulate(replace(problem, phases=problem.phases[:1]), first).z[-1]
+    # What a replay and a plan differ by, up to 1e-8 rad here, a landing multiplies.
+    assert plan.motions[1].evaluate(np.zeros(1)).z[0] == pytest.approx(end, abs=1e-13)
 
 
 TURNED = np.array([-0.05469906, 0.0494152, -2.18382371, 2.38529929, 2.03754111])
