@@ -165,14 +165,6 @@ class Formation:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
         return _LIMIT_FUNCTIONS(self)(z)[0][..., 0]
 
-    @exclusive
-    def evaluate_gap(self, contact: Contact, z: Array) -> Array:
-        """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
-        function = ca.Function(
-            "gap", [build_features(self.scene).z], [build_pair(contact, self.scene).gap]
-        )
-        return np.asarray(function(z.T).full()[0])
-
 
 @exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
