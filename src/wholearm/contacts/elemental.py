@@ -165,17 +165,13 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     return contacts
 
 
-def build_features(scene: Scene) -> Features:
-    """Return the scene's features as expressions of z, the same for scenes of one shape."""
-    return _FEATURES(scene)
-
-
 def _build_features(scene: Scene) -> Features:
     links = [(ca.DM(link.base), link.length, link.radius) for link in scene.fingers]
     return place_bodies(ca.DM(scene.polygon.vertices.T), links)
 
 
-_FEATURES = Store(_build_features, lambda scene: scene.shape)
+build_features = Store(_build_features, lambda scene: scene.shape)
+"""The features of a scene as expressions of z, the same for scenes of one shape."""
 
 
 def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:
