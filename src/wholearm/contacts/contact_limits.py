@@ -217,7 +217,8 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
 
 def _list_other_gaps(contact: Contact, scene: Scene) -> list[Expression]:
     """For each edge the largest gap of all others with an end of a link, by running maxima."""
-    values = ca.vertsplit(build_features(scene).stack_gaps("e", contact.surface, contact.finger))
+    pairs, edges = build_features(scene).pairs, range(scene.polygon.n_vertices)
+    values = [pairs[replace(contact, index=edge)].gap for edge in edges]
     before = list(accumulate(values[:-1], ca.fmax))
     after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
     inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]

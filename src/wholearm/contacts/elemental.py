@@ -106,11 +106,6 @@ class Features(NamedTuple):
     links: tuple[Link, ...]  # finger 1, finger 2
     pairs: dict[Contact, ContactPair]  # of all features of the object with all of the hand
 
-    def stack_gaps(self, feature: str, surface: str, finger: int | None) -> Expression:
-        """Gaps of all vertices or edges with a part of a finger, shape (n_v, 1) [m]."""
-        contacts = (Contact(feature, k, surface, finger) for k in range(self.vertices.shape[1]))
-        return ca.vertcat(*(self.pairs[contact].gap for contact in contacts))
-
 
 class GapLimit(NamedTuple):
     """A quantity that is positive while a contact formation is valid."""
