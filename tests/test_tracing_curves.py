@@ -175,7 +175,7 @@ def test_until_is_reached_exactly(heptagon: Problem, curves: tuple[Curve, ...]) 
         start = curve.end
         until = phase.until
         if until.contact is not None:
-            assert abs(curve.formation.evaluate_gap(until.contact, curve.end[None])[0]) < 1e-12
+            assert abs(until_distance(curve.formation, until, curve.end[None])[0]) < 1e-11
             assert until.contact in find_touching(heptagon.scene, curve.end)
         else:
             assert curve.end[2] == pytest.approx(until.value, abs=1e-13)

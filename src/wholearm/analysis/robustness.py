@@ -608,15 +608,12 @@ class Share:
     @property
     def interval(self) -> tuple[float, float]:
         """Least and largest probability p with |hits/total - p| <= z sigma(p)."""
+        from scipy.stats import binomtest
+
         if not self.total:
             return 0.0, 1.0
-        z = 1.959963984540054  # standard normal quantile of 0.975
-        share, spread = self.value, z**2 / self.total
-        centre = (share + spread / 2) / (1 + spread)
-        half = math.sqrt(share * (1 - share) * spread + spread**2 / 4) / (1 + spread)
-        # At the ends the interval begins and ends exactly there, but for rounding.
-        low = centre - half if self.hits else 0.0
-        return low, centre + half if self.hits < self.total else 1.0
+        interval = binomtest(self.hits, self.total).proportion_ci(method="wilson")
+        return float(interval.low), float(interval.high)
 
     @property
     def value(self) -> float:

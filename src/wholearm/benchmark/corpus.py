@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from fnmatch import fnmatch
 from functools import cache, partial
-from itertools import groupby, pairwise, product
+from itertools import chain, groupby, pairwise, product
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -706,15 +706,11 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
 
 def _flatten(value: Any) -> list[float] | None:
     """A number, or numbers in lists, as a list; None for anything else."""
-    if isinstance(value, bool) or value is None:
-        return None
-    if isinstance(value, int | float):
-        return [value]
-    if not isinstance(value, list) or not value:
-        return None
-    parts = [_flatten(entry) for entry in value]
-    lists = [part for part in parts if part is not None]
-    return [number for part in lists for number in part] if len(lists) == len(parts) else None
+    if isinstance(value, list) and value:
+        parts = [_flatten(entry) for entry in value]
+        return None if None in parts else [*chain(*filter(None, parts))]
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return [value] if is_number else None
 
 
 def _show(value: Any) -> str:

@@ -1,9 +1,9 @@
 """One thread at a time: CasADi counts references, and keeps tables, without locks of its own.
 
 Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
-uses CasADi holds one lock (`exclusive`, `kept_property`), and what it leaves behind is never
-deleted outside of it: values that objects keep are set aside when their owners go (`retire_with`),
-and an error that leaves the package takes no local variables along.
+uses CasADi holds one lock (`exclusive`), and what it leaves behind is never deleted outside of it:
+values that belong to objects (`Store`) are set aside when their owners go, and an error that leaves
+the package takes no local variables along.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from functools import wraps
 from threading import RLock
-from typing import Any, Generic, ParamSpec, TypeVar, overload
+from typing import Any, Generic, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary, WeakValueDictionary, finalize
 
 import numpy as np
@@ -52,53 +52,6 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return run
 
 
-class kept_property(Generic[_T]):  # noqa: N801 -- used like cached_property
-    """A cached property made of CasADi objects: computed and deleted under the lock.
-
-    Its value must not refer to the object that it belongs to, which would then live for ever.
-    """
-
-    def __init__(self, compute: Callable[[Any], _T]) -> None:
-        self._compute = compute
-        self.__doc__ = compute.__doc__
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    @overload
-    def __get__(self, instance: None, owner: type) -> kept_property[_T]: ...
-    @overload
-    def __get__(self, instance: object, owner: type) -> _T: ...
-    def __get__(self, instance: object | None, owner: type) -> kept_property[_T] | _T:
-        if instance is None:
-            return self
-        with LOCK:
-            # Another thread may have come first.
-            if self._name not in instance.__dict__:
-                value = exclusive(self._compute)(instance)
-                retire_with(instance, value)
-                instance.__dict__[self._name] = value
-            kept: _T = instance.__dict__[self._name]
-            return kept
-
-
-class Keeper:
-    """An object with kept properties: pickled and copied without them, to be computed anew."""
-
-    def __getstate__(self) -> dict[str, Any]:
-        kind = type(self)
-        return {
-            name: value
-            for name, value in self.__dict__.items()
-            if not isinstance(getattr(kind, name, None), kept_property)
-        }
-
-
-def retire_with(owner: object, value: object) -> None:
-    """Have `value` set aside, and not deleted, when its owner is."""
-    finalize(owner, _retired.append, value).atexit = False
-
-
 class _Share(Generic[_T]):
     """A value that each of its owners holds."""
 
@@ -124,7 +77,8 @@ class Store(Generic[_T]):
             key = self._identify(owner)
             share = self._known.get(key) or _Share(self._build(owner))
             self._known[key] = self._shares[owner] = share
-            retire_with(owner, share)
+            # Set aside, and not deleted, when its owner is.
+            finalize(owner, _retired.append, share).atexit = False
         return self._shares[owner].value
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import reduce
 from itertools import accumulate
 
 import casadi as ca
-import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Store, exclusive
+from ..common.sharing import Batch, Store
 from ..scene.model import Scene
 from .elemental import (
     Contact,
@@ -19,64 +18,60 @@ from .elemental import (
     build_features,
     build_once,
     candidate_contacts,
-    rotate_quarter,
 )
 
 FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
 ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
 
 
+def separate(first: Expression, second: Expression, size: Expression) -> Expression:
+    """Return the signed distance [m] of convex bodies from their corners, (2, n), anticlockwise.
+
+    The distance is the largest separation of their projections over all directions d, or minus the
+    penetration depth:
+
+        max_d (min_(p in first) d . p - max_(q in second) d . q)
+
+    Candidates are the normals of edges, of a segment on both sides, and the lines from corner to
+    corner; `size` [m] is that of a body, for lines between coincident corners.
+    """
+    parts = []
+    for body, other in ((first, second), (second, first)):
+        along = ca.horzcat(body[:, 1:], body[:, 0]) - body
+        outward = ca.vertcat(along[1, :], -along[0, :])
+        levels = outward.T @ other - ca.repmat(ca.sum1(outward * body).T, 1, other.shape[1])
+        nearest = reduce(ca.fmin, ca.horzsplit(levels))
+        parts.append(nearest / ca.hypot(along[0, :], along[1, :]).T)
+    for corner in ca.horzsplit(second):
+        runs, others = (body - ca.repmat(corner, 1, body.shape[1]) for body in (first, second))
+        distance = ca.sqrt(ca.sum1(runs**2) + ROUNDING * size**2).T
+        nearest, farthest = (
+            reduce(choose, ca.horzsplit(runs.T @ points))
+            for choose, points in ((ca.fmin, runs), (ca.fmax, others))
+        )
+        parts.append((nearest - farthest) / distance)
+    return ca.mmax(ca.vertcat(*parts))
+
+
 def build_finger_gap(scene: Scene) -> Expression:
     """Return the gap between the two links [m], an expression of the features' symbol z."""
-    axes, _ = _build_separation()
-    thickness = sum(link.radius for link in scene.fingers)
-    return axes(build_features(scene).z[3:], _list_numbers(scene)) - thickness
+    first, second = (ca.horzcat(link.base, link.tip) for link in build_features(scene).links)
+    size = sum(finger.length for finger in scene.fingers)
+    thickness = sum(finger.radius for finger in scene.fingers)
+    return separate(first, second, size) - thickness
 
 
-def _list_numbers(scene: Scene) -> Array:
-    """Base and length of both links, shape (6,) [m]."""
-    return np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
+def _build_finger_gaps(scene: Scene) -> Batch:
+    function = ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)])
+    return Batch(function)
 
 
-@lru_cache(maxsize=1)
-def _build_separation() -> tuple[Expression, Batch]:
-    """CasADi function of theta and (base, length) of both links: the gap between their axes.
-
-    The distance of two convex bodies is the largest separation of their projections over all
-    directions d, or minus the penetration depth. For two segments the candidates are both sides of
-    each link and the lines from an end of one to an end of the other, so that
-
-        gap = max_d (min_(q on link 2) d . q - max_(p on link 1) d . p)
-
-    is their distance when apart, minus the depth when they overlap, and continuous.
-    """
-    theta, numbers = ca.SX.sym("theta", 2), ca.SX.sym("numbers", 6)
-    bases, lengths = (numbers[:2], numbers[3:5]), (numbers[2], numbers[5])
-    axes = [ca.vertcat(ca.cos(theta[k]), ca.sin(theta[k])) for k in range(2)]
-    tips = [bases[k] + lengths[k] * axes[k] for k in range(2)]
-    parts = []
-    for k, other in ((0, 1), (1, 0)):
-        away = ca.horzcat(bases[other] - bases[k], tips[other] - bases[k])
-        ends = rotate_quarter(axes[k]).T @ away
-        parts += [ca.fmin(ends[0], ends[1]), -ca.fmax(ends[0], ends[1])]
-    # From base and tip of link 1 to base and tip of link 2; each link goes on from there along its
-    # axis or against it, and what goes on towards the other link takes from the separation.
-    first = ca.horzcat(bases[0], bases[0], tips[0], tips[0])
-    run = ca.horzcat(bases[1], tips[1], bases[1], tips[1]) - first
-    distance = ca.sqrt(ca.sum1(run**2) + ROUNDING * (lengths[0] + lengths[1]) ** 2)
-    onwards = axes[0].T @ run * ca.DM([[1.0, 1.0, -1.0, -1.0]]) * lengths[0]
-    backwards = axes[1].T @ run * ca.DM([[-1.0, 1.0, -1.0, 1.0]]) * lengths[1]
-    parts.append((distance - (ca.fmax(onwards, 0) + ca.fmax(backwards, 0)) / distance).T)
-    function = ca.Function("finger_gap", [theta, numbers], [ca.mmax(ca.vertcat(*parts))])
-    return function, Batch(function)
+_FINGER_GAPS = Store(_build_finger_gaps, lambda scene: scene.shape)
 
 
-@exclusive
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
-    """Signed distance of the links at configurations z (n, 5), (n,) [m]; NaN where theta is."""
-    numbers = np.broadcast_to(_list_numbers(scene), (len(z), 6))
-    gaps = _build_separation()[1](z[:, 3:], numbers)[0][:, 0, 0]
-    return np.asarray(gaps - sum(link.radius for link in scene.fingers))
+    """Signed distance of the links at configurations z (n, 5), shape (n,) [m]."""
+    return _FINGER_GAPS(scene)(z)[0][:, 0, 0]
 
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
@@ -222,7 +217,8 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
 
 def _list_other_gaps(contact: Contact, scene: Scene) -> list[Expression]:
     """For each edge the largest gap of all others with an end of a link, by running maxima."""
-    values = ca.vertsplit(build_features(scene).stack_gaps("e", contact.surface, contact.finger))
+    pairs, edges = build_features(scene).pairs, range(scene.polygon.n_vertices)
+    values = [pairs[replace(contact, index=edge)].gap for edge in edges]
     before = list(accumulate(values[:-1], ca.fmax))
     after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
     inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
@@ -230,30 +226,11 @@ def _list_other_gaps(contact: Contact, scene: Scene) -> list[Expression]:
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:
-    """Return the signed distance between a link and the object [m], by separating axes.
-
-    Candidates are the normals of link and edges, and the lines from ends of the link to vertices.
-    """
+    """Return the signed distance between a link and the object [m]."""
     features, part = build_features(scene), scene.fingers[finger]
     link = features.links[finger]
-    on_side, at_tip, at_joint = (
-        features.stack_gaps(kind, surface, finger)
-        for kind, surface in (("v", "finger"), ("e", "tip"), ("e", "joint"))
-    )
-    parts = [
-        ca.mmin(on_side),
-        -ca.mmax(on_side) - 2 * part.radius,
-        ca.mmax(ca.fmin(at_joint, at_tip)),
-    ]
-    for end, other in ((link.base, link.tip), (link.tip, link.base)):
-        rays = features.vertices - ca.repmat(end, 1, features.vertices.shape[1])
-        distance = ca.sqrt(ca.sum1(rays**2) + ROUNDING * part.length**2)
-        table = rays.T @ ca.horzcat(rays, other - end) / ca.repmat(distance.T, 1, rays.shape[1] + 1)
-        nearest = table[:, 0]
-        for column in range(1, rays.shape[1]):
-            nearest = ca.fmin(nearest, table[:, column])
-        parts.append(ca.mmax(nearest - ca.fmax(table[:, -1], 0)) - part.radius)
-    return ca.mmax(ca.vertcat(*parts))
+    ends = ca.horzcat(link.base, link.tip)
+    return separate(features.vertices, ends, part.length) - part.radius
 
 
 def measure_gaps(scene: Scene, z: Array) -> Array:

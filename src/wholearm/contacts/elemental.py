@@ -106,11 +106,6 @@ class Features(NamedTuple):
     links: tuple[Link, ...]  # finger 1, finger 2
     pairs: dict[Contact, ContactPair]  # of all features of the object with all of the hand
 
-    def stack_gaps(self, feature: str, surface: str, finger: int | None) -> Expression:
-        """Gaps of all vertices or edges with a part of a finger, shape (n_v, 1) [m]."""
-        contacts = (Contact(feature, k, surface, finger) for k in range(self.vertices.shape[1]))
-        return ca.vertcat(*(self.pairs[contact].gap for contact in contacts))
-
 
 class GapLimit(NamedTuple):
     """A quantity that is positive while a contact formation is valid."""
@@ -165,17 +160,13 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     return contacts
 
 
-def build_features(scene: Scene) -> Features:
-    """Return the scene's features as expressions of z, the same for scenes of one shape."""
-    return _FEATURES(scene)
-
-
 def _build_features(scene: Scene) -> Features:
     links = [(ca.DM(link.base), link.length, link.radius) for link in scene.fingers]
     return place_bodies(ca.DM(scene.polygon.vertices.T), links)
 
 
-_FEATURES = Store(_build_features, lambda scene: scene.shape)
+build_features = Store(_build_features, lambda scene: scene.shape)
+"""The features of a scene as expressions of z, the same for scenes of one shape."""
 
 
 def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:

@@ -11,7 +11,7 @@ keeps its value from where the rolling begins.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Keeper, Store, exclusive, kept_property
+from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
 from .elemental import (
@@ -45,7 +45,7 @@ class Kinematics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Formation(Keeper):
+class Formation:
     """A contact formation of a scene."""
 
     scene: Scene
@@ -141,10 +141,10 @@ class Formation(Keeper):
         P = ca.vertcat(A, A_t[list(self.rolling_rows), :])
         return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
 
-    @kept_property
+    @property
     def limits(self) -> tuple[GapLimit, ...]:
-        """Where this formation stops being valid, as expressions of its own scene's z."""
-        return tuple(list_limits(self.scene, self.contacts))
+        """Where this formation stops being valid, as expressions of the features' symbol z."""
+        return _LIMITS(self)
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
@@ -164,14 +164,6 @@ class Formation(Keeper):
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
         return _LIMIT_FUNCTIONS(self)(z)[0][..., 0]
-
-    @exclusive
-    def evaluate_gap(self, contact: Contact, z: Array) -> Array:
-        """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
-        function = ca.Function(
-            "gap", [build_features(self.scene).z], [build_pair(contact, self.scene).gap]
-        )
-        return np.asarray(function(z.T).full()[0])
 
 
 @exclusive
@@ -238,6 +230,11 @@ def _build_limit_function(formation: Formation) -> Batch:
 
 _FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts))
 _ROLL_FUNCTIONS = Store(_build_roll_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
-_LIMIT_FUNCTIONS = Store(
-    _build_limit_function, lambda f: (f.scene.shape, f.scene.fingers_collide, f.contacts)
-)
+
+
+def _identify_limits(formation: Formation) -> Hashable:
+    return formation.scene.shape, formation.scene.fingers_collide, formation.contacts
+
+
+_LIMITS = Store(lambda f: tuple(list_limits(f.scene, f.contacts)), _identify_limits)
+_LIMIT_FUNCTIONS = Store(_build_limit_function, _identify_limits)

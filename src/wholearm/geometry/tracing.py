@@ -225,7 +225,8 @@ def until_distance(formation: Formation, until: Until, z: Array) -> Array:
     """How far each configuration is from `until`, shape (n,), in radii of gyration or radians."""
     rho = formation.scene.scales.length
     if until.contact is not None:
-        return formation.evaluate_gap(until.contact, z) / rho
+        gained = Formation(formation.scene, (until.contact,))
+        return gained.evaluate(z, z).C[:, 0] / rho
     if until.value is None:
         return np.ones(len(z))
     if until.coordinate == "x":

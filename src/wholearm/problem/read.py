@@ -135,16 +135,17 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """The problem of a file's nested tables, or an `InputError` that names `source`."""
     with name_source(source):
         check_keys(table, "", TOP)
-        polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
-        fingers = _table(table, "fingers", FINGERS)
-        friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
+        polygon = Polygon(**collect_keys(Polygon, _table(table["object"], "object", OBJECT)))
+        fingers = _table(table["fingers"], "fingers", FINGERS)
+        coefficients = _table(table["friction"], "friction", FRICTION)
+        friction = Friction(**collect_keys(Friction, coefficients))
         right, left = (
-            Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
+            Finger(**collect_keys(Finger, _table(fingers[key], name, FINGER)), name=name)
             for key, name in ((key, f"fingers.{key}") for key in FINGERS)
         )
         scene = Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
         check_ranges(scene)
-        start = _table(table, "start", START)
+        start = _table(table["start"], "start", START)
         _check_edge(scene, start["flush"], "start.flush")
         z = place_start(scene, start["flush"], require_number(start["x"], "start.x"))
         entries = table.get("phases", [])
@@ -152,7 +153,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
             raise InputError("", "phases", f"{entries!r} is not a list of [[phases]]")
         uncertainty = None
         if "uncertainty" in table:
-            uncertainty = _table(table, "uncertainty", UNCERTAINTY)
+            uncertainty = _table(table["uncertainty"], "uncertainty", UNCERTAINTY)
         return Problem(
             scene=scene,
             start=z,
@@ -218,12 +219,10 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
     return z
 
 
-def read_phase(scene: Scene, index: int, entry: object) -> Phase:
+def read_phase(scene: Scene, index: int, given: object) -> Phase:
     """The phase of an entry of `[[phases]]`; an `InputError` for what is none."""
     key = f"phases[{index + 1}]"
-    if not isinstance(entry, dict):
-        raise InputError("", key, f"{entry!r} is not a table")
-    check_keys(entry, key, PHASE)
+    entry = _table(given, key, PHASE)
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
@@ -242,11 +241,9 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         raise InputError("", key, f"{given!r} is not a list of contact modes")
     scene, modes = formation.scene, list[ModeGuess]()
     count = formation.n_contacts
-    for row, entry in enumerate(given, start=1):
+    for row, mode in enumerate(given, start=1):
         name = f"{key}[{row}]"
-        if not isinstance(entry, Mapping):
-            raise InputError("", name, f"{entry!r} is not a table")
-        check_keys(entry, name, MODE)
+        entry = _table(mode, name, MODE)
         t, x, phi = (
             require_number(entry[quantity], f"{name}.{quantity}")
             for quantity in ("t", "x", "phi_deg")
@@ -320,12 +317,11 @@ def _at(key: str, read: Callable[[], _T]) -> _T:
         raise InputError("", key, error.problem) from None
 
 
-def _table(parent: Mapping[str, Any], key: str, known: Table, name: str = "") -> Mapping[str, Any]:
+def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
-    value = parent[key]
-    if not isinstance(value, dict):
-        raise InputError("", name or key, f"{value!r} is not a table")
-    check_keys(value, name or key, known)
+    if not isinstance(value, Mapping):
+        raise InputError("", key, f"{value!r} is not a table")
+    check_keys(value, key, known)
     return value
 
 

@@ -210,31 +210,22 @@ def assemble(
 ) -> Trajectory:
     """Sample motions that follow one another, `samples` rows to a phase and two to its held end."""
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
-    rows, times, forces, start = [], [], [], 0.0
+    rows, times, start = [], [], 0.0
     for motion in motions:
         if isinstance(motion, HeldMotion):
             local, row = motion.sample(samples)
         else:
             local = np.linspace(0.0, motion.duration, samples)
             row = motion.evaluate(local)
-        wide = np.full((2, len(local), len(contacts)), np.nan)
-        wide[:, :, [contacts.index(name) for name in motion.contacts]] = row.c_n, row.c_t
-        rows.append(row)
+        rows.append(row.spread(motion.contacts, contacts))
         times.append(start + local)
-        forces.append(wide)
         start += motion.duration
-    z, z_dot, z_ddot, tau = (np.concatenate([row[k] for row in rows]) for k in range(4))
-    c_n, c_t = np.concatenate(forces, axis=1)
+    columns = Samples(*map(np.concatenate, zip(*rows, strict=True)))
     return Trajectory(
-        z=z,
-        z_dot=z_dot,
-        z_ddot=z_ddot,
+        **columns._asdict(),
         t=np.concatenate(times),
-        tau=tau,
-        c_n=c_n,
-        c_t=c_t,
         contacts=contacts,
-        phase=np.repeat(np.arange(len(motions)), [len(row.z) for row in rows]),
+        phase=np.repeat(np.arange(len(motions)), list(map(len, times))),
         torque=torque,
         motions=tuple(motions),
         meta=dict(meta),

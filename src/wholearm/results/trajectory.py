@@ -32,6 +32,12 @@ class Samples(NamedTuple):
     c_n: Array  # c_n, c_t (n, n_c) [N]: in the order of the formation's contacts
     c_t: Array
 
+    def spread(self, own: Sequence[str], contacts: Sequence[str]) -> Samples:
+        """The forces of `own` contacts in the columns of all `contacts`, NaN in the others."""
+        forces = np.full((2, len(self.z), len(contacts)), np.nan)
+        forces[:, :, [contacts.index(name) for name in own]] = self.c_n, self.c_t
+        return Samples(*self[:4], *forces)
+
 
 class Motion(Protocol):
     """One phase of a trajectory as a function of time."""
@@ -134,16 +140,14 @@ class Trajectory(Drawn):
             wrong = times[~inside][0]
             raise ValueError(f"t = {wrong} s is outside the trajectory, 0 to {starts[-1]} s")
         owner = np.searchsorted(starts[1:-1], times, side="right")
-        n, m = len(times), len(self.contacts)
-        fields = Samples(*(np.full((n, width), np.nan) for width in (5, 5, 5, 2, m, m)))
+        widths = 5, 5, 5, 2, len(self.contacts), len(self.contacts)
+        fields = Samples(*(np.empty((len(times), width)) for width in widths))
         for index in sorted(set(owner.tolist())):
-            motion, rows = self.motions[index], np.flatnonzero(owner == index)
+            motion, rows = self.motions[index], owner == index
             part = motion.evaluate(times[rows] - starts[index])
-            columns = [self.contacts.index(name) for name in motion.contacts]
-            for whole, values in zip(fields[:4], part[:4], strict=True):
+            part = part.spread(motion.contacts, self.contacts)
+            for whole, values in zip(fields, part, strict=True):
                 whole[rows] = values
-            for whole, values in zip(fields[4:], part[4:], strict=True):
-                whole[rows[:, None], columns] = values
         return fields
 
     def find_steps(self) -> NDArray[np.int64]:

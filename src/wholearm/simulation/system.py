@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Keeper, kept_property
+from ..common.sharing import Batch
 from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.elemental import ContactPair, Link, place_bodies
 from ..scene.model import Scales, Scene
@@ -49,7 +49,7 @@ class ContactRows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Structure(Keeper):
+class Structure:
     """Coordinates and features of bodies of any size and weight."""
 
     z: Expression  # (n,)
@@ -78,7 +78,7 @@ class Structure(Keeper):
         (gap, A, bend), (slip, A_t, bend_t) = parts
         return gap, slip, A, A_t, bend, bend_t
 
-    @kept_property
+    @cached_property
     def gaps(self) -> Batch:
         """Function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
