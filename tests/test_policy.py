@@ -385,8 +385,8 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
 
 
 def test_a_contact_that_rolls_does_not_slip_at_another_speed() -> None:
-    flip = {"contacts": ["v1-palm", "v3-finger1", "v0-finger2"]}
-    flip["until"] = {"contact": "v1-finger2", "x": -0.08567}
+    until = {"contact": "v1-finger2", "x": -0.08567}
+    flip = {"contacts": ["v1-palm", "v3-finger1", "v0-finger2"], "until": until}
     problem = problem_of(HEXAGON).with_({"x": -0.07004, "phases": [flip]})
     plan = wholearm.solve(problem, replay=False).trajectory
     stretches = regulator.split_modes(problem.phases[0], plan, np.linspace(0, plan.duration, 30))
