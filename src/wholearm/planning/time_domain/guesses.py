@@ -80,11 +80,7 @@ class Guess(NamedTuple):
         first, *others = self.stages
         if np.abs(first.guess.nodes[0, 1]).max() < 1e-9:  # rounding
             return self
-        nodes = first.guess.nodes.copy()
-        nodes[0, 1] = 0.0
-        return self._replace(
-            stages=[replace(first, guess=first.guess._replace(nodes=nodes)), *others]
-        )
+        return self._replace(stages=[first.begin_at(first.guess.nodes[0, 0], np.zeros(5)), *others])
 
     def by_homotopy(self) -> Guess:
         """The same path, in the modes of the friction homotopy."""
@@ -268,10 +264,9 @@ class Guesses:
     def resume(self, name: str, stages: Sequence[Stage]) -> Guess:
         """From a solution with nearly the same start."""
         first, *others = stages
-        nodes = first.guess.nodes.copy()
-        nodes[0, 0] = self.nearest.stages[0].guess.nodes[0, 0]
-        stages = [replace(first, guess=first.guess._replace(nodes=nodes)), *others]
-        return Guess(name, self._leave_room(stages))
+        start = self.nearest.stages[0].guess.nodes[0, 0]
+        begun = first.begin_at(start, first.guess.nodes[0, 1])
+        return Guess(name, self._leave_room([begun, *others]))
 
     def every(self, goal: Array | None = None) -> Iterator[Guess]:
         """All in their order; `goal`: the end of the first, straight one, or that of pins."""

@@ -223,9 +223,14 @@ def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
 
 
 def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
-    """Stages without one of them, or None if it is all that its phase has."""
-    left = [*stages[:index], *stages[index + 1 :]]
-    return left if any(other.phase == stages[index].phase for other in left) else None
+    """Stages without one of them, or None if it is all that its phase has.
+
+    They begin where the first one does. Case: new polygon 23 with periods of 2 ms, phase 9.
+    """
+    gone, left = stages[index], [*stages[:index], *stages[index + 1 :]]
+    if all(other.phase != gone.phase for other in left):
+        return None
+    return left if index else [left[0].begin_at(*gone.guess.nodes[0]), *left[1:]]
 
 
 def _join(first: StagePoints, second: StagePoints) -> StagePoints:

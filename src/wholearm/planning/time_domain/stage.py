@@ -173,6 +173,12 @@ class Stage:
         longer = part._replace(duration=factor * part.duration, nodes=nodes, v=v, a=a)
         return replace(self, guess=longer)
 
+    def begin_at(self, z: Array, v: Array) -> Stage:
+        """The same stage with another state, (5,) each, where its guess begins."""
+        nodes = self.guess.nodes.copy()
+        nodes[0] = z, v
+        return replace(self, guess=self.guess._replace(nodes=nodes))
+
     def list_clearances(self, places: Array, after: float) -> Array:
         """Least values of monitored limits at `places`, shape (n,), of the stage: (n, n_monitored).
 
