@@ -798,9 +798,8 @@ class FreeRun(Run):
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made, of length `h` to `t`, to its first event, if there is one."""
         watch, low = self.watch, (self.values < -self.floor).any()
-        if not (watch.alarm or low or watch.may_close(REACH / LOOKS)):
-            return []
-        return self.find_first(h)
+        # A shorter step is looked at where it ends, alone.
+        return self.find_first(h) if watch.alarm or low or watch.travel >= REACH / LOOKS else []
 
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
@@ -941,22 +940,21 @@ class Watch:
     def __init__(self, system: System) -> None:
         n, count = system.n, len(system.names)
         sizes = np.cumsum([0, 3 * n, count, count, count, count, 3 * n, 1])
-        inputs, outputs, within = np.zeros(sizes[-1]), np.zeros(2 * count + 3), np.zeros(1)
+        inputs, outputs = np.zeros(sizes[-1]), np.zeros(2 * count + 3)
         parts = [inputs[first:last] for first, last in pairwise(sizes)]
         self.motion, self.gaps, self.ranges, self.level, self.watched, self.end, self._h = parts
         self.ahead, self.spans = outputs[:count], outputs[count : 2 * count]
         self._start, self._seen = inputs[3 * n : 3 * n + 2 * count], outputs[: 2 * count]
-        self._flags, self._within, self._places = outputs[-3:], within, 2 * n
+        self._flags, self._places = outputs[-3:], 2 * n
         numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
-        functions = zip(_build_watch(system.structure), (outputs, within), strict=True)
-        self._calls = [bind(function, [inputs, numbers], store) for function, store in functions]
+        self._look = bind(_build_watch(system.structure), [inputs, numbers], outputs)
 
     def look(self, s: ModeStepper) -> None:
         """Evaluate gaps and ranges at the end of the step just made."""
         split, out = self._places, s.outputs
         self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
         self._h[0] = s.inputs[s.at.h]
-        self._calls[0]()
+        self._look()
         self.alarm, self.travel = bool(self._flags[1]), float(self._flags[2])
 
     def advance(self) -> float:
@@ -964,23 +962,10 @@ class Watch:
         self.motion[:], self._start[:] = self.end, self._seen
         return float(self._flags[0])
 
-    def may_close(self, least: float) -> bool:
-        """Whether some pair may close within the step, if it is at least so long."""
-        if self.travel < least:
-            return False
-        self._calls[1]()
-        return bool(self._within[0])
-
 
 @lru_cache(maxsize=16)
-def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
-    """CasADi functions of the vectors of `Watch`.
-
-    The first one returns gaps, ranges, longest step, alarm and travel. The second one returns
-    whether a pair may close within the step: a cubic with values and rates at both ends is between
-    its Bezier coefficients, and gaps and ranges are taken to be there but for a hundredth of the
-    spread of these.
-    """
+def _build_watch(structure: Structure) -> Expression:
+    """CasADi function of the vectors of `Watch`: gaps, ranges, longest step, alarm and travel."""
     n, count = structure.n, len(structure.pairs)
     sizes = [3 * n, count, count, count, count, 3 * n, 1]
     inputs = ca.SX.sym("given", sum(sizes))
@@ -996,30 +981,12 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     speed, push = (ca.mmax(ca.fabs(part) / units) for part in (end[n : 2 * n], end[2 * n :]))
     longest = 2 * REACH / (speed + ca.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
     least = ca.if_else(gap > ARMED * unit, 0, level)
-
-    def combine(*conditions: Expression) -> Expression:
-        return reduce(ca.logic_and, conditions)
-
-    closes = combine(gaps < least, gap >= least)
-    enters = combine(ranges > 0, span <= 0, gaps < -CLOSED * unit, gaps > -REACH * unit)
+    closes = ca.logic_and(gaps < least, gap >= least)
+    overlap = gaps < -CLOSED * unit, gaps > -REACH * unit
+    enters = reduce(ca.logic_and, (ranges > 0, span <= 0, *overlap))
     alarm = ca.mmax(watched * ca.logic_or(closes, enters))
     outputs = ca.vertcat(gaps, ranges, longest, alarm, travel)
-    look = ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
-    v = ca.SX.sym("v", n)
-    both = structure.gaps.function(structure.z, geometry)
-    rates = ca.reshape(ca.jtimes(ca.vec(both), structure.z, v), -1, 2)
-    rate = ca.Function("rate", [structure.z, v, geometry], [both, rates])
-    (first, opens), (last, closing) = (
-        rate(state[:n], state[n : 2 * n], geometry) for state in (motion, end)
-    )
-    points = [first, first + h * opens / 3, last - h * closing / 3, last]
-    lowest, highest = reduce(ca.fmin, points), reduce(ca.fmax, points)
-    error = 1e-2 * (highest - lowest) + CLOSED * unit
-    (low, inside), (high, outside) = map(ca.horzsplit, (lowest - error, highest + error))
-    closes = combine(gap >= least, low < least, outside > -1e-3 * unit)
-    enters = combine(inside <= 0, outside > 0, low < -CLOSED * unit, high > -REACH * unit)
-    flag = ca.mmax(watched * ca.logic_or(closes, enters))
-    return look, ca.Function("within", [inputs, numbers], [ca.densify(flag)])
+    return ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
 
 
 def _name(system: System, joint: int) -> str:
