@@ -717,9 +717,7 @@ def find_moving(
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in modes.list_units(formation) if slow[list(unit.rows)].all()]
-    holds = formation.n_constraints < 4
-    options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    patterns = modes.list_modes(formation, signs, still, options)
+    patterns = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
     tried = (modes.respond(mode, signs, rows, v) for signs, mode in patterns)
 
     def misfit(response: modes.Response) -> float:
