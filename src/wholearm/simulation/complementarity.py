@@ -71,14 +71,11 @@ class ContactProblem:
     @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
         """Units of forces that make the diagonal one, the matrix in them, and the rates without."""
-        rows, pushes, b, s = self.A, self.G, self.b_n, len(self.b_t)
-        if s:
-            rows, pushes = np.vstack([rows, self.T]), np.vstack([pushes, self.T])
-            b = np.concatenate([b, self.b_t])
-        lifted = rows * self.lift
+        rows, pushes = (np.concatenate([part, self.T]) for part in (self.A, self.G))
+        lifted, k = rows * self.lift, len(self.b_n)
         units = 1 / np.sqrt((lifted * rows).sum(axis=1))
         K = (lifted @ pushes.T) * (units[:, None] * units)
-        return units[: len(b) - s], units[len(b) - s :], K, units * b
+        return units[:k], units[k:], K, units * np.concatenate([self.b_n, self.b_t])
 
     @cached_property
     def is_unique(self) -> bool:
@@ -136,13 +133,10 @@ def solve_problem(p: ContactProblem) -> ContactAnswer | None:
 def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
     """Rates, signs and friction shares that forces give."""
     p = problem
-    if not len(f):
-        change = p.lift * (c_n @ p.G)
-        return ContactAnswer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
     change, size = p.lift * (c_n @ p.G + f @ p.T), np.abs(f)
     most = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
     # Friction whose bound is zero by c_n has no margin in either direction.
-    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max())
+    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max(initial=0.0))
     r_t = p.b_t + p.T @ change
     sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
     shares = size / np.maximum(most, 1e-300)
@@ -181,40 +175,34 @@ def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list
     modes = None if choice is None else tuple(choice)
     ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
     s_n, s_t, K, q = p.scaled
-    k, left = len(s_n), K
-    if len(s_t):
-        # A contact that slides brings its friction with it, what turns has a given one.
-        held = (p.owner >= 0).nonzero()[0]
-        owner, bound = p.owner[held], ways * (p.bound / s_t)
-        rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
-        rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
-        partner[owner] = k + held
-        left = K - rubs[:, None, :] * K[:, partner]
-        right = bound @ K[:, k:].T - q
-    else:
-        right = np.broadcast_to(-q, active.shape)
+    k = len(s_n)
+    # A contact that slides brings its friction with it, what turns has a given one.
+    held = (p.owner >= 0).nonzero()[0]
+    owner, bound = p.owner[held], ways * (p.bound / s_t)
+    rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
+    rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
+    partner[owner] = k + held
+    left, right = K - rubs[:, None, :] * K[:, partner], bound @ K[:, k:].T - q
     # Forces without a condition are zero, by rows of the unit matrix.
     left = np.where(active[:, :, None] & active[:, None, :], left, np.eye(len(q)))
     sound = np.abs(np.linalg.det(left)) > SINGULAR
     forces = np.linalg.solve(left[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
-    if len(s_t):
-        forces[:, k:] -= bound[sound]
-        forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
+    forces[:, k:] -= bound[sound]
+    forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
     rates = q + forces @ K.T
     size = float(np.abs(q).max(initial=0.0)) or 1.0
     slack = EDGE * size
     pair = forces[:, :k], rates[:, :k]
     obeys = (np.minimum(*pair) >= -slack) & (np.abs(pair[0] * pair[1]) <= slack * size)
     fine = np.logical_and.reduce(obeys, axis=1)
-    if len(s_t) and fine.any():
-        forces, rates = forces[fine], rates[fine]
-        most = np.maximum(forces[:, :k] * s_n, 0.0)
-        most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
-        f, r = forces[:, k:], rates[:, k:]
-        spare = most / s_t - np.abs(f)
-        # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
-        opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
-        fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
+    forces, rates = forces[fine], rates[fine]
+    most = np.maximum(forces[:, :k] * s_n, 0.0)
+    most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
+    f, r = forces[:, k:], rates[:, k:]
+    spare = most / s_t - np.abs(f)
+    # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
+    opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
+    fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
     distinct: list[int] = []
     for row in fine.nonzero()[0].tolist():
         if all(np.abs(rates[row] - rates[other]).max() > SAME * size for other in distinct):
