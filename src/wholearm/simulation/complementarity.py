@@ -101,8 +101,7 @@ class ContactAnswer(NamedTuple):
 
     c_n: Array  # (k,)
     f: Array  # (s,)
-    r_n: Array  # r_n, r_t (k,) and (s,):
-    r_t: Array
+    r_n: Array  # (k,)
     shares: Array  # (s,): friction over the most that it may be
     sign: Array  # (s,): sliding sign where friction is at its bound, 0 where it holds
     change: Array  # (n,): M^-1 (G^T c_n + T^T f)
@@ -137,10 +136,9 @@ def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.
     most = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
     # Friction whose bound is zero by c_n has no margin in either direction.
     edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max(initial=0.0))
-    r_t = p.b_t + p.T @ change
-    sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
-    shares = size / np.maximum(most, 1e-300)
-    return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, sign, change, residual)
+    slides = np.where(f != 0, -f, p.b_t + p.T @ change)
+    sign, shares = np.where(edge, np.sign(slides), 0.0), size / np.maximum(most, 1e-300)
+    return ContactAnswer(c_n, f, p.b_n + p.A @ change, shares, sign, change, residual)
 
 
 @lru_cache(maxsize=256)
