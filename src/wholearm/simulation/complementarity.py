@@ -562,21 +562,15 @@ class FreeRun(Run):
             closed = ClosedContacts(pairs, system.evaluate(self.z, self.v, pairs))
         pattern = Pattern(self, closed)
         later = SETTLING * system.scales.time
-        coming = free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
-        problem, rows = pattern.pose(free, pattern.rows), pattern.rows
-        answer = first = self._answer(problem, pattern.recall(self.modes))
+        free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
+        first = self._answer(pattern.pose(free, pattern.rows), pattern.recall(self.modes))
         if first is None:
             return None
         acceleration = free + first.change
-        self.unique = problem.is_unique
-        # What presses or parts by more does not vanish within that time.
-        s_n, _, _, q = problem.scaled
-        least = 1e-3 * float(np.abs(q).max(initial=0.0))
-        if not self.unique or (np.maximum(first.c_n / s_n, first.r_n * s_n) <= least).any():
-            v = self.v + later * acceleration
-            rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
-            coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
-            answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
+        v = self.v + later * acceleration
+        rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
+        coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
+        answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
         if answer is None:
             return None
         # What rests leaves its last modes by rounding, before it takes others in which it rests.
