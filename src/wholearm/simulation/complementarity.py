@@ -588,8 +588,6 @@ class FreeRun(Run):
 
     def _answer(self, problem: ContactProblem, *likely: Sequence[int]) -> ContactAnswer | None:
         """The solution with some likely modes, or another."""
-        if problem.is_unique and (answers := list_answers(problem)):
-            return answers[0]
         for modes in likely:
             if answers := list_answers(problem, modes):
                 return answers[0]
