@@ -731,8 +731,8 @@ class FreeRun(Run):
         self.kept = list(self.modes.kept)
         watch.watched[:] = 1.0
         watch.watched[self.kept] = 0.0
-        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], counts)
+        self.counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
         self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
         sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
@@ -805,8 +805,7 @@ class FreeRun(Run):
         modes, rows, watch = self.s.modes, self.s.rows, self.watch
         if not self.unique or modes.stuck or modes.held:
             return False
-        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], counts)
+        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
         # What has no direction has no speed that could reverse.
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1

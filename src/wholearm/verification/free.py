@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.document import Document, Result, Table, fixed
-from ..common.errors import InputError, require_number
+from ..common.errors import InputError, name_phases, require_number
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import list_renamed
 from ..geometry.curve import describe_pose
@@ -82,8 +82,7 @@ def verify_free(
     for indices, part in simulate_phases(problem, plan, progress=progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
-        title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
-        warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
+        warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
         failures += [] if part.outcome.kind is OutcomeKind.ENDED else [part.outcome.text]
         for phase in compared:
             title, end = f"phase {phase.number} alone", phase.deviation
