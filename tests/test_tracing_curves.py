@@ -172,11 +172,10 @@ def test_until_is_reached_exactly(heptagon: Problem, curves: tuple[Curve, ...]) 
     for phase, curve in zip(heptagon.phases, curves, strict=True):
         assert curve.reached
         np.testing.assert_allclose(curve.start, start, rtol=0, atol=1e-14)
-        start = curve.end
-        until = phase.until
+        start, until = curve.end, phase.until
         if until.contact is not None:
-            gap = EndDistance(heptagon.scene, until, curve.start).measure(curve.end[None])[0]
-            assert abs(gap) < 1e-12
+            gap = EndDistance(heptagon.scene, until, curve.start).measure
+            assert abs(gap(curve.end[None])[0]) < 1e-12
             assert until.contact in find_touching(heptagon.scene, curve.end)
         else:
             assert curve.end[2] == pytest.approx(until.value, abs=1e-13)
@@ -360,9 +359,8 @@ def test_outlines_are_closed_at_every_point_and_end_where_their_phase_does(
             assert np.abs(plane.measure_gaps(part.formation, part.z)).max() < CLOSED
             assert part.formation.evaluate_limits(part.z).min() > -CLOSED
         if not phase.until.is_release:
-            end, start = parts[-1].z[-1:], parts[0].z[0]
-            distance = EndDistance(flipping.scene, phase.until, start).measure(end)
-            assert abs(distance[0]) < CLOSED
+            distance = EndDistance(flipping.scene, phase.until, parts[0].z[0])
+            assert abs(distance.measure(parts[-1].z[-1:])[0]) < CLOSED
 
 
 @pytest.mark.parametrize(
