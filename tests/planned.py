@@ -153,9 +153,9 @@ class LandingMotion:
         z_dot, z_ddot = np.zeros_like(z), np.zeros_like(z)
         for rates, k in (z_dot, 1), (z_ddot, 2):
             rates[:, 0], rates[:, 2] = x[k], phi[k]
-            _, A, _, bend = self.formation.evaluate(z, z_dot)[:4]
-            right = -np.einsum("nij,nj->ni", A, rates) - (bend if k == 2 else 0.0)
-            rates[:, DEPENDENT] = np.linalg.solve(A[:, :, DEPENDENT], right[..., None])[..., 0]
+            P, bend = self.formation.evaluate(z, z_dot)[-2:]
+            right = -np.einsum("nij,nj->ni", P, rates) - (bend if k == 2 else 0.0)
+            rates[:, DEPENDENT] = np.linalg.solve(P[:, :, DEPENDENT], right[..., None])[..., 0]
         A_t = self.formation.evaluate(z, z_dot).A_t
         return z, z_dot, z_ddot, np.hstack([np.einsum("nij,nj->ni", A_t, z_dot), z_dot[:, 3:]])
 

@@ -362,8 +362,8 @@ def test_equations_of_motion_hold_and_contacts_are_closed_at_any_instant(
         np.testing.assert_allclose(samples.c_t, law, rtol=1e-12)
         assert np.abs(measure_gaps(formation, samples.z)).max() < 1e-14
         kinematics = formation.evaluate(samples.z, samples.z_dot)
-        opening = np.einsum("nij,nj->ni", kinematics.A, samples.z_dot)
-        change = np.einsum("nij,nj->ni", kinematics.A, samples.z_ddot) + kinematics.A_dot_v
+        opening = np.einsum("nij,nj->ni", kinematics.P, samples.z_dot)
+        change = np.einsum("nij,nj->ni", kinematics.P, samples.z_ddot) + kinematics.P_dot_v
         # Rounding, of speeds of some m/s and accelerations of some 100 m/s^2.
         assert np.abs(opening).max() < 1e-13 and np.abs(change).max() < 1e-9
 

@@ -21,7 +21,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import POINTS, PathGuess, guess_phase
-from wholearm.geometry.tracing import trace_curve, trace_phases, until_distance
+from wholearm.geometry.tracing import EndDistance, trace_curve, trace_phases
 from wholearm.mechanics.dynamics import close_contacts, metric_weights
 from wholearm.planning.time_domain.time_plan import plan_phases
 
@@ -172,10 +172,10 @@ def test_until_is_reached_exactly(heptagon: Problem, curves: tuple[Curve, ...]) 
     for phase, curve in zip(heptagon.phases, curves, strict=True):
         assert curve.reached
         np.testing.assert_allclose(curve.start, start, rtol=0, atol=1e-14)
-        start = curve.end
-        until = phase.until
+        start, until = curve.end, phase.until
         if until.contact is not None:
-            assert abs(until_distance(curve.formation, until, curve.end[None])[0]) < 1e-11
+            gap = EndDistance(heptagon.scene, until, curve.start).measure
+            assert abs(gap(curve.end[None])[0]) < 1e-12
             assert until.contact in find_touching(heptagon.scene, curve.end)
         else:
             assert curve.end[2] == pytest.approx(until.value, abs=1e-13)
@@ -359,8 +359,8 @@ def test_outlines_are_closed_at_every_point_and_end_where_their_phase_does(
             assert np.abs(plane.measure_gaps(part.formation, part.z)).max() < CLOSED
             assert part.formation.evaluate_limits(part.z).min() > -CLOSED
         if not phase.until.is_release:
-            end = parts[-1].z[-1:]
-            assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED
+            distance = EndDistance(flipping.scene, phase.until, parts[0].z[0])
+            assert abs(distance.measure(parts[-1].z[-1:])[0]) < CLOSED
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import takes_over
+from ..geometry.tracing import EndDistance
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile, format_rows, read_rows
@@ -28,7 +29,7 @@ from ..simulation.events import Event, EventKind, FreeSimulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
-from ..verification.verdict import DEPARTURE, EndDistance
+from ..verification.verdict import DEPARTURE
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
 FACTOR = 1.1
@@ -373,7 +374,8 @@ class PassageTuner:
         self, problem: Problem, passage: Passage, z: Array, options: TuningOptions
     ) -> None:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
-        self.end = EndDistance(problem.scene, passage.until, z)
+        until = passage.until.lead(z, problem.scene.scales.length)
+        self.end = EndDistance(problem.scene, until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
         self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
         self.limit, scales = problem.scene.torque_limit, problem.scene.scales

@@ -290,14 +290,14 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
     `labels` (n, n_c) are indices into `contact_table`; z, v (n, 5), v is `z` if left out.
     """
     v = z if v is None else v
-    C, A_dot_v = np.empty((2, *labels.shape))
+    C, P_dot_v = np.empty((2, *labels.shape))
     A, A_t = np.empty((2, *labels.shape, 5))
     for index in np.unique(labels).tolist():
         rows, places = np.nonzero(labels == index)
         contact = _make_single(scene, index).evaluate(z[rows], v[rows])
-        C[rows, places], A_dot_v[rows, places] = contact.C[:, 0], contact.A_dot_v[:, 0]
+        C[rows, places], P_dot_v[rows, places] = contact.C[:, 0], contact.P_dot_v[:, 0]
         A[rows, places], A_t[rows, places] = contact.A[:, 0], contact.A_t[:, 0]
-    return Kinematics(C, A, A_t, A_dot_v, A, A_dot_v)
+    return Kinematics(C, A, A_t, A, P_dot_v)
 
 
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
@@ -371,8 +371,8 @@ def move(
     with np.errstate(divide="ignore", invalid="ignore"):
         z_u[:, 3:] = -np.einsum("nij,nj->ni", A[:, 1:, :3], z_u[:, :3]) / levers
         at = evaluate_each(scene, labels, z, z_u)
-        z_uu[:, 1] = -at.A_dot_v[:, 0]
-        z_uu[:, 3:] = -(at.A_dot_v[:, 1:] + A[:, 1:, 1] * z_uu[:, 1:2]) / levers
+        z_uu[:, 1] = -at.P_dot_v[:, 0]
+        z_uu[:, 3:] = -(at.P_dot_v[:, 1:] + A[:, 1:, 1] * z_uu[:, 1:2]) / levers
     return z, z_u, z_uu, at
 
 

@@ -39,9 +39,8 @@ class Kinematics(NamedTuple):
     C: Array  # (n, n_c) [m]
     A: Array  # A, A_t (n, n_c, 5):
     A_t: Array
-    A_dot_v: Array  # (n, n_c): A' v for the velocities v that were given, so that A z'' = -A' z'
     P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
-    P_dot_v: Array  # (n, n_c + R): P' v; A' v itself where nothing rolls
+    P_dot_v: Array  # (n, n_c + R): P' v for the velocities v that were given: P z'' = -P' z'
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +147,12 @@ class Formation:
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
-        C, A, A_t, A_dot_v = _FUNCTIONS(self)(z, v)
-        P, P_dot_v = A, A_dot_v
+        C, A, A_t, P_dot_v = _FUNCTIONS(self)(z, v)
+        P = A
         if self.rolling:
             P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1)
-            P_dot_v = np.concatenate([A_dot_v, _ROLL_FUNCTIONS(self)(z, v)[1]], axis=1)
-        return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0], P, P_dot_v[..., 0])
+            P_dot_v = np.concatenate([P_dot_v, _ROLL_FUNCTIONS(self)(z, v)[1]], axis=1)
+        return Kinematics(C[..., 0], A, A_t, P, P_dot_v[..., 0])
 
     def evaluate_slip(self, z: Array) -> Array:
         """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""

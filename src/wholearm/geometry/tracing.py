@@ -7,6 +7,7 @@ integrated spectrally. No coordinate is singled out: none has to be monotonic.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,7 +23,7 @@ from ..contacts.formation import Formation, describe, find_touching
 from ..mechanics.dynamics import find_freedoms, metric_weights
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import read_problem
-from ..scene.model import TOUCHING
+from ..scene.model import TOUCHING, Scene
 from .curve import Curve, Panel, border, describe_pose, refine
 
 NODES = 17  # nodes of a panel
@@ -152,7 +153,7 @@ def _trace_phase(phase: Phase, z: Array) -> Curve:
 def _holds(formation: Formation, until: Until, z: Array) -> bool:
     """Whether `until` holds at `z`; a contact counts within the ends of its edge and link only."""
     if until.contact is None:
-        return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
+        return bool(EndDistance(formation.scene, until, z).measure(z[None])[0] < HELD)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
     return bool(len(gaps) and (np.abs(gaps) < HELD).all())
@@ -162,8 +163,9 @@ def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
     """Both unit tangents at `z`, the one that approaches `until` first."""
     null, back = find_headings(formation, z, 0.0)
     step = 1e-6 * formation.scene.polygon.gyration_radius
-    distances = until_distance(formation, until, np.array([z, z + step * null]))
-    return [null, back] if abs(distances[1]) <= abs(distances[0]) else [back, null]
+    places = np.array([z, z + step * null])
+    here, ahead = np.abs(EndDistance(formation.scene, until, z).measure(places))
+    return [null, back] if ahead <= here else [back, null]
 
 
 def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[Array, ...]:
@@ -186,16 +188,13 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
     wanted = [k for k in wanted if not closed[k]] or wanted
     wanted = [len(names) - 1] if until.contact is None else wanted
+    end_distance = EndDistance(formation.scene, until, z)
 
     def margins(points: Array) -> Array:
-        values = formation.evaluate_limits(points) / rho
-        if until.contact is not None:
-            return np.hstack([values, np.ones((len(points), 1))])
-        return np.hstack([values, until_distance(formation, until, points)[:, None] * side])
+        # Where a contact is gained is among the limits.
+        left = end_distance.measure(points) if until.contact is None else np.ones(len(points))
+        return np.column_stack([formation.evaluate_limits(points) / rho, left])
 
-    side = 1.0
-    if until.contact is None:
-        side = float(np.sign(until_distance(formation, until, z[None])[0])) or 1.0
     panels: list[Panel] = []
 
     def end(s: float, text: str, reached: bool = False) -> Curve:
@@ -221,17 +220,33 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     return end(start, f"nothing happens up to {describe_pose(z)}")
 
 
-def until_distance(formation: Formation, until: Until, z: Array) -> Array:
-    """How far each configuration is from `until`, shape (n,), in radii of gyration or radians."""
-    rho = formation.scene.scales.length
-    if until.contact is not None:
-        gained = Formation(formation.scene, (until.contact,))
-        return gained.evaluate(z, z).C[:, 0] / rho
-    if until.value is None:
-        return np.ones(len(z))
-    if until.coordinate == "x":
-        return np.asarray((z[:, 0] - until.value) / rho)
-    return np.asarray(z[:, 2] - until.value)
+class EndDistance:
+    """Distance to the end of a phase that begins at `start`, (5,); NaN for a release [m or rad]."""
+
+    def __init__(self, scene: Scene, until: Until, start: Array) -> None:
+        gained = until.contact
+        self.gained = None if gained is None else Formation(scene, (gained,))
+        self.unit = "rad" if until.coordinate == "phi" else "m"
+        self.scale = 1.0 if self.unit == "rad" else scene.scales.length
+        self.row, value = until.poses[0] if until.value is not None else (0, math.nan)
+        self.value, self.side = value, math.copysign(1.0, start[self.row] - value)
+
+    def evaluate(self, z: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Distance at n states, (n,), its gradient, (n, 5), and its bend, (n,).
+
+        The bend is what the velocity alone adds to its second derivative.
+        """
+        if self.gained is not None:
+            at = self.gained.evaluate(z, v)
+            return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
+        gradient = np.zeros(z.shape)
+        gradient[:, self.row] = self.side
+        return self.side * (z[:, self.row] - self.value), gradient, np.zeros(len(z))
+
+    def measure(self, z: Array) -> Array:
+        """Distance at n configurations, (n,), in radii of gyration or rad; one for a release."""
+        distances = self.evaluate(z, z)[0] / self.scale
+        return np.where(np.isnan(distances), 1.0, distances)
 
 
 def find_crossing(

@@ -46,9 +46,7 @@ class TorquePolygon(NamedTuple):
 
     def measure(self, tau: Array) -> Array:
         """How far torques, shape (n, 2), are beyond a side; negative inside, (n,) [N m]."""
-        if not len(self.normals):
-            return np.full(len(tau), -np.inf)
-        return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
+        return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1, initial=-np.inf))
 
     def is_empty(self, limit: Array) -> bool:
         """Whether no torques up to `limit`, shape (2,) [N m], maybe infinite, are inside."""

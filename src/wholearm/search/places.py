@@ -15,7 +15,7 @@ from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose
-from ..geometry.tracing import HELD, find_crossing, until_distance
+from ..geometry.tracing import HELD, EndDistance, find_crossing
 from ..mechanics.dynamics import close_contacts
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene
@@ -115,12 +115,12 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
         if goal.x is None or not is_flush(scene, formation.contacts, goal.flush):
             return None
         until = Until(coordinate="x", value=goal.x)
-    first = float(until_distance(formation, until, curve.start[None])[0])
-    if abs(first) < HELD:
+    distance = EndDistance(scene, until, curve.start)
+    if distance.measure(curve.start[None])[0] < HELD:
         return None
 
     def measure_left(z: Array) -> Array:
-        return np.asarray(np.sign(first) * until_distance(formation, until, z)[:, None])
+        return distance.measure(z)[:, None]
 
     crossings = filter(None, (find_crossing(panel, measure_left) for panel in curve.panels))
     s = next((s for s, _ in crossings), math.inf)

@@ -71,14 +71,11 @@ class ContactProblem:
     @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
         """Units of forces that make the diagonal one, the matrix in them, and the rates without."""
-        rows, pushes, b, s = self.A, self.G, self.b_n, len(self.b_t)
-        if s:
-            rows, pushes = np.vstack([rows, self.T]), np.vstack([pushes, self.T])
-            b = np.concatenate([b, self.b_t])
-        lifted = rows * self.lift
+        rows, pushes = (np.concatenate([part, self.T]) for part in (self.A, self.G))
+        lifted, k = rows * self.lift, len(self.b_n)
         units = 1 / np.sqrt((lifted * rows).sum(axis=1))
         K = (lifted @ pushes.T) * (units[:, None] * units)
-        return units[: len(b) - s], units[len(b) - s :], K, units * b
+        return units[:k], units[k:], K, units * np.concatenate([self.b_n, self.b_t])
 
     @cached_property
     def is_unique(self) -> bool:
@@ -104,8 +101,7 @@ class ContactAnswer(NamedTuple):
 
     c_n: Array  # (k,)
     f: Array  # (s,)
-    r_n: Array  # r_n, r_t (k,) and (s,):
-    r_t: Array
+    r_n: Array  # (k,)
     shares: Array  # (s,): friction over the most that it may be
     sign: Array  # (s,): sliding sign where friction is at its bound, 0 where it holds
     change: Array  # (n,): M^-1 (G^T c_n + T^T f)
@@ -136,17 +132,13 @@ def solve_problem(p: ContactProblem) -> ContactAnswer | None:
 def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
     """Rates, signs and friction shares that forces give."""
     p = problem
-    if not len(f):
-        change = p.lift * (c_n @ p.G)
-        return ContactAnswer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
     change, size = p.lift * (c_n @ p.G + f @ p.T), np.abs(f)
     most = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
     # Friction whose bound is zero by c_n has no margin in either direction.
-    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max())
-    r_t = p.b_t + p.T @ change
-    sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
-    shares = size / np.maximum(most, 1e-300)
-    return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, sign, change, residual)
+    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max(initial=0.0))
+    slides = np.where(f != 0, -f, p.b_t + p.T @ change)
+    sign, shares = np.where(edge, np.sign(slides), 0.0), size / np.maximum(most, 1e-300)
+    return ContactAnswer(c_n, f, p.b_n + p.A @ change, shares, sign, change, residual)
 
 
 @lru_cache(maxsize=256)
@@ -181,40 +173,34 @@ def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list
     modes = None if choice is None else tuple(choice)
     ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
     s_n, s_t, K, q = p.scaled
-    k, left = len(s_n), K
-    if len(s_t):
-        # A contact that slides brings its friction with it, what turns has a given one.
-        held = (p.owner >= 0).nonzero()[0]
-        owner, bound = p.owner[held], ways * (p.bound / s_t)
-        rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
-        rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
-        partner[owner] = k + held
-        left = K - rubs[:, None, :] * K[:, partner]
-        right = bound @ K[:, k:].T - q
-    else:
-        right = np.broadcast_to(-q, active.shape)
+    k = len(s_n)
+    # A contact that slides brings its friction with it, what turns has a given one.
+    held = (p.owner >= 0).nonzero()[0]
+    owner, bound = p.owner[held], ways * (p.bound / s_t)
+    rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
+    rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
+    partner[owner] = k + held
+    left, right = K - rubs[:, None, :] * K[:, partner], bound @ K[:, k:].T - q
     # Forces without a condition are zero, by rows of the unit matrix.
     left = np.where(active[:, :, None] & active[:, None, :], left, np.eye(len(q)))
     sound = np.abs(np.linalg.det(left)) > SINGULAR
     forces = np.linalg.solve(left[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
-    if len(s_t):
-        forces[:, k:] -= bound[sound]
-        forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
+    forces[:, k:] -= bound[sound]
+    forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
     rates = q + forces @ K.T
     size = float(np.abs(q).max(initial=0.0)) or 1.0
     slack = EDGE * size
     pair = forces[:, :k], rates[:, :k]
     obeys = (np.minimum(*pair) >= -slack) & (np.abs(pair[0] * pair[1]) <= slack * size)
     fine = np.logical_and.reduce(obeys, axis=1)
-    if len(s_t) and fine.any():
-        forces, rates = forces[fine], rates[fine]
-        most = np.maximum(forces[:, :k] * s_n, 0.0)
-        most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
-        f, r = forces[:, k:], rates[:, k:]
-        spare = most / s_t - np.abs(f)
-        # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
-        opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
-        fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
+    forces, rates = forces[fine], rates[fine]
+    most = np.maximum(forces[:, :k] * s_n, 0.0)
+    most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
+    f, r = forces[:, k:], rates[:, k:]
+    spare = most / s_t - np.abs(f)
+    # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
+    opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
+    fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
     distinct: list[int] = []
     for row in fine.nonzero()[0].tolist():
         if all(np.abs(rates[row] - rates[other]).max() > SAME * size for other in distinct):
@@ -576,21 +562,15 @@ class FreeRun(Run):
             closed = ClosedContacts(pairs, system.evaluate(self.z, self.v, pairs))
         pattern = Pattern(self, closed)
         later = SETTLING * system.scales.time
-        coming = free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
-        problem, rows = pattern.pose(free, pattern.rows), pattern.rows
-        answer = first = self._answer(problem, pattern.recall(self.modes))
+        free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
+        first = self._answer(pattern.pose(free, pattern.rows), pattern.recall(self.modes))
         if first is None:
             return None
         acceleration = free + first.change
-        self.unique = problem.is_unique
-        # What presses or parts by more does not vanish within that time.
-        s_n, _, _, q = problem.scaled
-        least = 1e-3 * float(np.abs(q).max(initial=0.0))
-        if not self.unique or (np.maximum(first.c_n / s_n, first.r_n * s_n) <= least).any():
-            v = self.v + later * acceleration
-            rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
-            coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
-            answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
+        v = self.v + later * acceleration
+        rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
+        coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
+        answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
         if answer is None:
             return None
         # What rests leaves its last modes by rounding, before it takes others in which it rests.
@@ -608,8 +588,6 @@ class FreeRun(Run):
 
     def _answer(self, problem: ContactProblem, *likely: Sequence[int]) -> ContactAnswer | None:
         """The solution with some likely modes, or another."""
-        if problem.is_unique and (answers := list_answers(problem)):
-            return answers[0]
         for modes in likely:
             if answers := list_answers(problem, modes):
                 return answers[0]
@@ -753,8 +731,8 @@ class FreeRun(Run):
         self.kept = list(self.modes.kept)
         watch.watched[:] = 1.0
         watch.watched[self.kept] = 0.0
-        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], counts)
+        self.counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
         self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
         sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
@@ -798,9 +776,8 @@ class FreeRun(Run):
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made, of length `h` to `t`, to its first event, if there is one."""
         watch, low = self.watch, (self.values < -self.floor).any()
-        if not (watch.alarm or low or watch.may_close(REACH / LOOKS)):
-            return []
-        return self.find_first(h)
+        # A shorter step is looked at where it ends, alone.
+        return self.find_first(h) if watch.alarm or low or watch.travel >= REACH / LOOKS else []
 
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
@@ -828,8 +805,7 @@ class FreeRun(Run):
         modes, rows, watch = self.s.modes, self.s.rows, self.watch
         if not self.unique or modes.stuck or modes.held:
             return False
-        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], counts)
+        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
         # What has no direction has no speed that could reverse.
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
@@ -941,22 +917,21 @@ class Watch:
     def __init__(self, system: System) -> None:
         n, count = system.n, len(system.names)
         sizes = np.cumsum([0, 3 * n, count, count, count, count, 3 * n, 1])
-        inputs, outputs, within = np.zeros(sizes[-1]), np.zeros(2 * count + 3), np.zeros(1)
+        inputs, outputs = np.zeros(sizes[-1]), np.zeros(2 * count + 3)
         parts = [inputs[first:last] for first, last in pairwise(sizes)]
         self.motion, self.gaps, self.ranges, self.level, self.watched, self.end, self._h = parts
         self.ahead, self.spans = outputs[:count], outputs[count : 2 * count]
         self._start, self._seen = inputs[3 * n : 3 * n + 2 * count], outputs[: 2 * count]
-        self._flags, self._within, self._places = outputs[-3:], within, 2 * n
+        self._flags, self._places = outputs[-3:], 2 * n
         numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
-        functions = zip(_build_watch(system.structure), (outputs, within), strict=True)
-        self._calls = [bind(function, [inputs, numbers], store) for function, store in functions]
+        self._look = bind(_build_watch(system.structure), [inputs, numbers], outputs)
 
     def look(self, s: ModeStepper) -> None:
         """Evaluate gaps and ranges at the end of the step just made."""
         split, out = self._places, s.outputs
         self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
         self._h[0] = s.inputs[s.at.h]
-        self._calls[0]()
+        self._look()
         self.alarm, self.travel = bool(self._flags[1]), float(self._flags[2])
 
     def advance(self) -> float:
@@ -964,23 +939,10 @@ class Watch:
         self.motion[:], self._start[:] = self.end, self._seen
         return float(self._flags[0])
 
-    def may_close(self, least: float) -> bool:
-        """Whether some pair may close within the step, if it is at least so long."""
-        if self.travel < least:
-            return False
-        self._calls[1]()
-        return bool(self._within[0])
-
 
 @lru_cache(maxsize=16)
-def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
-    """CasADi functions of the vectors of `Watch`.
-
-    The first one returns gaps, ranges, longest step, alarm and travel. The second one returns
-    whether a pair may close within the step: a cubic with values and rates at both ends is between
-    its Bezier coefficients, and gaps and ranges are taken to be there but for a hundredth of the
-    spread of these.
-    """
+def _build_watch(structure: Structure) -> Expression:
+    """CasADi function of the vectors of `Watch`: gaps, ranges, longest step, alarm and travel."""
     n, count = structure.n, len(structure.pairs)
     sizes = [3 * n, count, count, count, count, 3 * n, 1]
     inputs = ca.SX.sym("given", sum(sizes))
@@ -996,30 +958,12 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     speed, push = (ca.mmax(ca.fabs(part) / units) for part in (end[n : 2 * n], end[2 * n :]))
     longest = 2 * REACH / (speed + ca.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
     least = ca.if_else(gap > ARMED * unit, 0, level)
-
-    def combine(*conditions: Expression) -> Expression:
-        return reduce(ca.logic_and, conditions)
-
-    closes = combine(gaps < least, gap >= least)
-    enters = combine(ranges > 0, span <= 0, gaps < -CLOSED * unit, gaps > -REACH * unit)
+    closes = ca.logic_and(gaps < least, gap >= least)
+    overlap = gaps < -CLOSED * unit, gaps > -REACH * unit
+    enters = reduce(ca.logic_and, (ranges > 0, span <= 0, *overlap))
     alarm = ca.mmax(watched * ca.logic_or(closes, enters))
     outputs = ca.vertcat(gaps, ranges, longest, alarm, travel)
-    look = ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
-    v = ca.SX.sym("v", n)
-    both = structure.gaps.function(structure.z, geometry)
-    rates = ca.reshape(ca.jtimes(ca.vec(both), structure.z, v), -1, 2)
-    rate = ca.Function("rate", [structure.z, v, geometry], [both, rates])
-    (first, opens), (last, closing) = (
-        rate(state[:n], state[n : 2 * n], geometry) for state in (motion, end)
-    )
-    points = [first, first + h * opens / 3, last - h * closing / 3, last]
-    lowest, highest = reduce(ca.fmin, points), reduce(ca.fmax, points)
-    error = 1e-2 * (highest - lowest) + CLOSED * unit
-    (low, inside), (high, outside) = map(ca.horzsplit, (lowest - error, highest + error))
-    closes = combine(gap >= least, low < least, outside > -1e-3 * unit)
-    enters = combine(inside <= 0, outside > 0, low < -CLOSED * unit, high > -REACH * unit)
-    flag = ca.mmax(watched * ca.logic_or(closes, enters))
-    return look, ca.Function("within", [inputs, numbers], [ca.densify(flag)])
+    return ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
 
 
 def _name(system: System, joint: int) -> str:

@@ -33,7 +33,7 @@ torques that keep them closed are so weak that impacts on arrival last longer th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -132,12 +132,14 @@ _share_mode = lru_cache(maxsize=64)(Mode)
 
 
 def list_modes(
-    formation: Formation, signs: Array, units: Sequence[Unit], options: Iterable[Sequence[float]]
+    formation: Formation, signs: Array, units: Sequence[Unit], held: bool = True
 ) -> Iterator[tuple[Array, Mode]]:
-    """Each combination of signs of some units, zero where held, that leaves a freedom to move in.
+    """Each combination of signs of some units that leaves a freedom to move in.
 
-    They replace those among `signs`, (n_c + 2,); `options` are those to try, for each unit.
+    They replace those among `signs`, (n_c + 2,); zero is one of units with friction that may be
+    `held`.
     """
+    options = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
     for choice in product(*options):
         tried = signs.copy()
         for unit, sign in zip(units, choice, strict=True):
@@ -335,9 +337,8 @@ class Rest:
 
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
-        formation, units = self.formation, list_units(self.formation)
-        options = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
-        patterns = list_modes(formation, np.zeros(formation.n_contacts + 2), units, options)
+        formation, none = self.formation, np.zeros(self.formation.n_contacts + 2)
+        patterns = list_modes(formation, none, list_units(formation), held)
         candidates = [
             (mode, signs)
             for signs, mode in patterns

@@ -930,8 +930,7 @@ class Replay(Run):
                     margins.append(gained[row])
             return float(min(margins)), float(held[:count].min())
 
-        options = [(1.0, -1.0, 0.0) if unit.grips else (1.0, -1.0) for unit in still]
-        patterns = list(modes.list_modes(formation, signs, still, options))
+        patterns = modes.list_modes(formation, signs, still)
         measured = [(measure(*pattern), pattern) for pattern in patterns]
         choices = [(*margins, pattern) for margins, pattern in measured if margins is not None]
         pressing = [choice for choice in choices if min(choice[:2]) > -CLEAR]

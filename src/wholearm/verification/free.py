@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.document import Document, Result, Table, fixed
-from ..common.errors import InputError, require_number
+from ..common.errors import InputError, name_phases, require_number
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import list_renamed
 from ..geometry.curve import describe_pose
+from ..geometry.tracing import EndDistance
 from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
@@ -28,7 +29,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verdict import DEPARTURE, EndDistance, measure_departure
+from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -81,8 +82,7 @@ def verify_free(
     for indices, part in simulate_phases(problem, plan, progress=progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
-        title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
-        warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
+        warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
         failures += [] if part.outcome.kind is OutcomeKind.ENDED else [part.outcome.text]
         for phase in compared:
             title, end = f"phase {phase.number} alone", phase.deviation
@@ -244,9 +244,10 @@ def _find_end(
         closed = [s for s in simulation.stretches if s.contact == until.contact.name]
         times += [max(s.start, start) for s in closed if s.stop > start]
     elif until.value is not None:
-        z = simulation.z[rows]
-        distance, _, _ = EndDistance(simulation.problem.scene, until, z[0]).evaluate(z, z)
-        times = simulation.t[rows[distance <= 0][:1]].tolist()
+        z, scene = simulation.z[rows], simulation.problem.scene
+        until = until.lead(z[0], scene.scales.length)
+        reached = EndDistance(scene, until, z[0]).measure(z) <= 0
+        times = simulation.t[rows[reached][:1]].tolist()
     else:
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
         times = [e.time for e in lost if e.contact in list_leaving(phase, after)]

@@ -17,7 +17,7 @@ from ..geometry.curve import describe_pose
 from ..mechanics import UNIQUENESS
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
-from ..problem.definition import End, Phase, Problem, Until
+from ..problem.definition import End, Phase, Problem
 from ..results.plan_record import Deviation
 from ..results.report import ContactMargin, Failure, FingerGap, PhaseReport, UniquenessMargin
 from ..results.trajectory import Trajectory
@@ -58,30 +58,6 @@ def measure_stray(problem: Problem) -> float:
     return 5e-7 * problem.scene.scales.force + STRAY * problem.epsilon
 
 
-class EndDistance:
-    """Distance to the end of a phase that begins at `start`, (5,); NaN for a release [m or rad]."""
-
-    def __init__(self, scene: Scene, until: Until, start: Array) -> None:
-        self.until = until.lead(start, scene.scales.length)
-        gained = self.until.contact
-        self.gained = None if gained is None else Formation(scene, (gained,))
-        self.unit = "rad" if self.until.coordinate == "phi" else "m"
-        self.row, value = self.until.poses[0] if self.until.value is not None else (0, math.nan)
-        self.value, self.side = value, math.copysign(1.0, start[self.row] - value)
-
-    def evaluate(self, z: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Distance at n states, (n,), its gradient, (n, 5), and its bend, (n,).
-
-        The bend is what the velocity alone adds to its second derivative.
-        """
-        if self.gained is not None:
-            at = self.gained.evaluate(z, v)
-            return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
-        gradient = np.zeros(z.shape)
-        gradient[:, self.row] = self.side
-        return self.side * (z[:, self.row] - self.value), gradient, np.zeros(len(z))
-
-
 def measure_speed(scene: Scene, v: Array) -> float:
     """Largest speed in z', shape (5,) [m/s]: angular ones count times the scene's length."""
     length = scene.scales.length
@@ -111,7 +87,8 @@ def describe_failures(
             if scene.scales.length * turns[fastest] > speed:
                 body = ("the object", "finger 1", "finger 2")[fastest]
                 moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
-            unit = EndDistance(scene, phase.until, simulation.z[first]).unit
+            until = phase.until.lead(simulation.z[first], scene.scales.length)
+            unit = "rad" if until.coordinate == "phi" else "m"
             text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
                 f"{event.value:.3g} {unit}/s at t = {event.time:.5g} s, while {moves}, with "

@@ -15,6 +15,7 @@ from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.formation import Formation
+from ..geometry.tracing import EndDistance
 from ..mechanics.dynamics import Directions, force_rows
 from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
 from ..mechanics.statics import Statics
@@ -548,9 +549,10 @@ def _examine_loss(
         row = int(rows[simulation.t[rows] <= time][-1])
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
-    end, distance = verdict.EndDistance(problem.scene, phase.until, simulation.z[rows[0]]), None
+    scene, start, distance = problem.scene, simulation.z[rows[0]], None
     if not phase.until.is_release:
-        distance = end.evaluate(z[None], v[None])
+        until = phase.until.lead(start, scene.scales.length)
+        distance = EndDistance(scene, until, start).evaluate(z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
@@ -625,7 +627,7 @@ def find_approach(simulation: Simulation) -> results.Approach | None:
     if phase.until.is_release:
         return None
     t, z, v = simulation.t[rows], simulation.z[rows], simulation.z_dot[rows]
-    end = verdict.EndDistance(problem.scene, phase.until, z[0])
+    end = EndDistance(problem.scene, phase.until.lead(z[0], scales.length), z[0])
     gaps, gradient, _ = end.evaluate(z, v)
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps)
@@ -715,9 +717,7 @@ def find_moving(
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in modes.list_units(formation) if slow[list(unit.rows)].all()]
-    holds = formation.n_constraints < 4
-    options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    patterns = modes.list_modes(formation, signs, still, options)
+    patterns = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
     tried = (modes.respond(mode, signs, rows, v) for signs, mode in patterns)
 
     def misfit(response: modes.Response) -> float:
