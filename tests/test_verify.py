@@ -561,7 +561,7 @@ def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
 
 def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     """The plan is one for a smaller epsilon."""
-    short, options = 1e-3, PlanOptions(intervals=10)
+    short, options = 1e-3, PlanOptions(intervals=20)
     slide = part_of(problem_of(HEPTAGON), 0, 1)
     easy = replace(slide, epsilon=slide.epsilon - short)
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)

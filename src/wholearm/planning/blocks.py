@@ -128,10 +128,10 @@ def plan_blocks(
         require_steps(problem, options)
     planning = Planning(problem, curves, options, ())
     if options.goal is not Objective.MARGIN:
-        return plan_each(_begin_each(planning, report), report)
+        return plan_each(planning, report)
     fast = replace(options, objective=Objective.TIME, duration=None)
     first = replace(planning, options=fast, ahead=False)
-    least = plan_each(_begin_each(first, report), report).plans
+    least = plan_each(first, report).plans
     times = [plan.motion.duration for plan in least]
     longest = 2 * sum(times) if options.duration is None else options.duration
     return plan_each(replace(planning, allowed=share_duration(times, longest), least=least), report)
@@ -143,37 +143,6 @@ def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     for _, block in zip_longest(range(count), planning.blocks):
         made = plan_next(made, block, report)
     return _require_margin(made)
-
-
-def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
-
-    What refuses a later phase is soon told. Blocks along curves after it have none, as they will
-    begin elsewhere: they are traced alone. An error is raised only if it does not depend on where
-    exactly the block before ends.
-    """
-    blocks, scene = split_blocks(planning.problem), planning.problem.scene
-    # Ends are chosen once, when the block is planned.
-    coarse = replace(planning, ahead=False)
-    over_time = [not runs_along_curves(block, planning.options) for block in blocks]
-    if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
-        return planning
-    for index, block in enumerate(blocks):
-        after = any(over_time[:index])
-        try:
-            if after and not over_time[index]:
-                z = coarse.blocks[-1].end
-                traced = BlockPlan(block, z, [], trace_block(coarse, block, z), coarse=True)
-                coarse = replace(coarse, blocks=(*coarse.blocks, traced))
-            else:
-                coarse = plan_next(coarse, None, report, coarse=True)
-        except WholearmError as error:
-            short = error.shortfalls if isinstance(error, InfeasibleError) else ()
-            # A better plan of earlier phases does not help against large violations.
-            if not after or any(shortfall.share > 0.05 for shortfall in short):
-                raise
-            break
-    return replace(planning, blocks=coarse.blocks)
 
 
 def plan_next(

@@ -1,10 +1,9 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-Direct collocation along the curve, refined in the loop of `refinement`. Elements end where the plan
-switches from one active limit to another: first where the minimum-time sweep does, then where the
-solution does. They are halved while violations between nodes cost more than the accuracy. Limits
-are tightened by their violations until none exceeds `MISS`; what that costs is the estimate of the
-error.
+Direct collocation along the curve, refined in the loop of `refinement`. Elements end where the
+minimum-time profile of a sweep switches from one active limit to another. They are halved while
+violations between nodes cost more than the accuracy. Limits are tightened by their violations until
+none exceeds `MISS`; what that costs is the estimate of the error.
 
 **NLP.** On a curve z(s) everything is affine in a = s'', b = s'^2 and the internal force lambda,
 but for viscous friction (`PathForces`). Unknowns are a_k, b_k and lambda_k at the nodes s_k of
@@ -56,11 +55,9 @@ from .path_mesh import (
     equidistribute,
     find_ends,
     find_fastest,
-    find_switches,
     halve,
     keep_apart,
     make_grid,
-    match,
 )
 from .path_motion import (
     DEGREE,
@@ -358,8 +355,6 @@ class PathIterate:
     """A mesh with its NLP, and the solution on it or the point to start from."""
 
     task: Task
-    breaks: tuple[Array, ...]  # [m]: of each curve, where elements end at switches
-    cuts: tuple[Array, ...]  # [m]: other ends of elements of each curve, if some were halved
     parts: list[PhaseData]  # each phase on its grid
     data: PhaseData  # all phases as one
     nlp: PathNLP
@@ -372,42 +367,36 @@ class PathIterate:
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
         """Start from the minimum-time speed profile, or a parabola of the squared speed."""
-        none = [np.zeros(0)] * len(task.curves)
-        parts, breaks = task.lay_out(none, elements), [*none]
+        breaks = [np.zeros(0)] * len(task.curves)
+        parts = task.lay_out(breaks, elements)
         data = join(parts)
         profile, units = guess(data, task.options.time_weight)
         swept = task.options.goal is Objective.TIME and not task.is_held
         if swept and (fastest := find_fastest(data)):
             # Breaks at the switches, but on a curve where a fixed number of elements is too few.
             starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-            places = np.array([switch.place for switch in fastest.switches])
-            owner = np.searchsorted(starts[1:-1], places)
+            owner = np.searchsorted(starts[1:-1], fastest.switches)
             for k, curve in enumerate(task.curves):
-                on_curve = keep_apart(curve, places[owner == k] - starts[k])
+                on_curve = keep_apart(curve, fastest.switches[owner == k] - starts[k])
                 if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
                     breaks[k] = on_curve
             parts = task.lay_out(breaks, elements)
             profile = guess_below(join(parts), fastest)
-        return PathIterate.on(task, (breaks, none), parts, units, profile, 0.0)
+        return PathIterate.on(task, parts, units, profile, 0.0)
 
     @staticmethod
     def on(
-        task: Task,
-        edges: tuple[Sequence[Array], Sequence[Array]],
-        parts: list[PhaseData],
-        units: Units,
-        profile: Profile,
-        margin: float,
+        task: Task, parts: list[PhaseData], units: Units, profile: Profile, margin: float
     ) -> PathIterate:
-        """The NLP on elements with these breaks and cuts, near a motion and its margin [N].
+        """The NLP on the elements of phases, near a motion and its margin [N].
 
         Multipliers are those near the central path.
         """
-        data, (breaks, cuts) = join(parts), map(tuple, edges)
+        data = join(parts)
         nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), task.options.goal)
         first = PathSolution(profile, margin, center(nlp, data, units, profile, margin))
         none = Tightening.none(data, task.duration)
-        return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none)
+        return PathIterate(task, parts, data, nlp, units, first, none)
 
     def restart(self) -> PathIterate | None:
         """The solution on the mesh before with tightened limits, or more elements, once."""
@@ -441,13 +430,13 @@ class PathIterate:
         return replace(self, solution=solution)
 
     def adapt(self) -> PathIterate | None:
-        """The next one to solve: with rows or breaks for this motion, halved, or tightened."""
+        """The next one to solve: with rows for this motion, on other elements, or tightened."""
         task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
-        again = self.meshes < 6  # most meshes whose breaks move
         # A first plan that misses much by signs of no row is a reference only; case: two releases
         # of a pentagon, whose plan takes 20 % longer.
         slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
-        if task.guides and again and (slack / self.data.spans).min() < -0.05:
+        references = 6  # most
+        if task.guides and self.meshes < references and (slack / self.data.spans).min() < -0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
         # What tightening by the violations will cost, and what it has.
@@ -460,38 +449,27 @@ class PathIterate:
             grow = self.meshes >= 2 and task.options.intervals is None
             count = task.elements * 3 // 2 if grow else task.elements
             each = zip(self.parts, self.motions, shares, strict=True)
-            return self._move([equidistribute(*phase, count) for phase in each], self.cuts, count)
-        if not task.is_held and (self.meshes == 0 or costly) and self.meshes < SOLVES:
-            # Neither least effort nor tightened limits show where the switches are.
-            breaks, shift = self.breaks, 0.0
-            if not (task.options.goal is Objective.EFFORT or bool(self.tightening.missed.any())):
-                every = zip(self.parts, self.motions, self.breaks, strict=True)
-                matches = [
-                    match(before, find_switches(part, motion.profile, margin), part.curve)
-                    for part, motion, before in every
-                ]
-                breaks = tuple(places for places, _ in matches)
-                shift = max(distance for _, distance in matches)  # over the curve's length
-            if shift > 25.0 * accuracy and again:  # over length and accuracy
-                return self._move(breaks, self.cuts, task.elements)
+            return self._move([equidistribute(*phase, count) for phase in each], count)
+        if costly and not task.is_held and self.meshes < SOLVES and task.options.intervals is None:
             edges = [part.grid.edges for part in self.parts]
             count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
-            if costly and task.options.intervals is None and 2 * count >= task.elements:
-                halved = [halve(*pair, count) for pair in zip(edges, shares, strict=True)]
-                return self._move(breaks, halved, task.elements)
+            halved = [halve(*pair, count) for pair in zip(edges, shares, strict=True)]
+            finer = self._move(halved, task.elements)
+            # Where elements have their least length, halving more of them gains nothing.
+            if len(finer.parts[0].grid.edges) >= len(edges[0]) + task.elements // 2:
+                return finer
         return self.tighten() if self.violation > 1 else None
 
-    def _move(self, breaks: Sequence[Array], cuts: Sequence[Array], elements: int) -> PathIterate:
-        """Start on at least so many other elements from this motion."""
-        every = zip(self.task.curves, breaks, cuts, strict=True)
-        held = self.task.is_held
-        ends = [keep_apart(curve, np.append(places, more), held) for curve, places, more in every]
+    def _move(self, breaks: Sequence[Array], elements: int) -> PathIterate:
+        """Start on at least so many other elements, with these breaks, from this motion."""
+        every, held = zip(self.task.curves, breaks, strict=True), self.task.is_held
+        ends = [keep_apart(curve, places, held) for curve, places in every]
         parts, old = self.task.lay_out(ends, elements), self.solution
         grid = join(parts).grid
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units, profile, old.margin)
+        made = PathIterate.on(self.task, parts, self.units, profile, old.margin)
         return replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
 
     def tighten(self) -> PathIterate:
