@@ -245,12 +245,10 @@ def pairs() -> Pairs:
 
 
 def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
-    """Along a curve from rest to rest nothing but what each node needs.
-
-    Unknowns are speed, acceleration and squeeze, but for the speed at both ends, where it is 0.
-    Rows are how the speed goes on, and at each node contact forces, both sides of the cones of
-    rolling contacts, and torques.
-    """
+    """Along a curve from rest to rest nothing but what each node needs."""
+    # Unknowns are speed, acceleration and squeeze, but for the speed at both ends, where it is 0.
+    # Rows are how the speed goes on, and at each node contact forces, both sides of the cones of
+    # rolling contacts, and torques.
     nodes, rest = divmod(cost["unknowns"] + 2, 3)
     # Five nodes for each element of four intervals, of which switches may ask for more.
     assert rest == nodes % 5 == 0 and nodes >= 5 * INTERVALS // 4

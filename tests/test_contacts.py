@@ -13,13 +13,7 @@ from rows import each
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
 from wholearm.common.arrays import Array
-from wholearm.contacts import closing
-from wholearm.contacts.elemental import (
-    build_features,
-    build_pair,
-    candidate_contacts,
-    parse_contact,
-)
+from wholearm.contacts import closing, elemental
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.mapping.borders import label_cells
 from wholearm.verification.newton_euler import locate
@@ -43,7 +37,7 @@ def configurations(seed: int, count: int = 20) -> Array:
 
 def test_gaps_and_rows_are_those_of_rigid_bodies(scene: Scene) -> None:
     """Points and normals of bodies give the Jacobians of the C-functions."""
-    contacts = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
+    contacts = tuple(c for part in (None, 0, 1) for c in elemental.candidate_contacts(scene, part))
     z = configurations(1)
     rows = Formation(scene, contacts).evaluate(z, z)
     for k, contact in enumerate(contacts):
@@ -54,9 +48,9 @@ def test_gaps_and_rows_are_those_of_rigid_bodies(scene: Scene) -> None:
 
 
 def test_names_round_trip(scene: Scene) -> None:
-    contacts = [c for part in (None, 0, 1) for c in candidate_contacts(scene, part)]
+    contacts = [c for part in (None, 0, 1) for c in elemental.candidate_contacts(scene, part)]
     assert len(set(contacts)) == 5 + 2 * 15
-    assert [parse_contact(contact.name, scene) for contact in contacts] == contacts
+    assert [elemental.parse_contact(contact.name, scene) for contact in contacts] == contacts
     assert [str(contact) for contact in contacts] == [contact.name for contact in contacts]
 
 
@@ -70,22 +64,25 @@ def test_names_round_trip(scene: Scene) -> None:
 )
 def test_bad_name_lists_what_is_allowed(scene: Scene, name: Any) -> None:
     with pytest.raises(InputError, match="allowed are vN-palm") as caught:
-        parse_contact(name, scene)
+        elemental.parse_contact(name, scene)
     assert repr(name) in caught.value.problem and "0 to 4" in caught.value.problem
 
 
 def test_pointed_tip_has_no_arc() -> None:
     pointed = plane.make_scene(KITE, radius=0.0)
-    assert len(candidate_contacts(pointed, 0)) == 10
+    assert len(elemental.candidate_contacts(pointed, 0)) == 10
     with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
-        parse_contact("v1-tip1", pointed)
+        elemental.parse_contact("v1-tip1", pointed)
 
 
 @each("name", NAMES)
 def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
     formation = plane.make_formation(scene, name)
-    slip, z_symbol = build_pair(formation.contacts[0], scene).slip, build_features(scene).z
+    slip, z_symbol = (
+        elemental.build_pair(formation.contacts[0], scene).slip,
+        elemental.build_features(scene).z,
+    )
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
     rng = np.random.default_rng(6)
     for z in configurations(6, 8):
@@ -180,7 +177,7 @@ def test_flush_edge_lies_on_the_palm(seed: int) -> None:
 def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     scene = plane.make_scene(plane.SQUARE)
     sliding = plane.make_formation(scene, f"v1-palm {name} v0-finger2")
-    formation = Formation(scene, sliding.contacts, (parse_contact(name, scene),))
+    formation = Formation(scene, sliding.contacts, (elemental.parse_contact(name, scene),))
     assert (formation.n_contacts, formation.n_rolling, formation.n_constraints) == (3, 1, 4)
     assert formation.rolling_rows == (1,) and formation.contacts == sliding.contacts
     assert formation.sliding_friction == pytest.approx([0.1, 0.0, 0.1])
@@ -259,7 +256,7 @@ def test_limits_are_clearances(scene: Scene, names: str, z: Array, text: str, cl
 )
 def test_limit_knows_what_is_gained(names: str, text: str, gained: str | None) -> None:
     limits = {limit.text: limit.gained for limit in plane.make_formation(WIDE, names).limits}
-    assert limits[text] == (parse_contact(gained, WIDE) if gained else None)
+    assert limits[text] == (elemental.parse_contact(gained, WIDE) if gained else None)
 
 
 @pytest.mark.parametrize("finger", [0, 1])
@@ -302,7 +299,7 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
     del first
     gc.collect()
     values = ca.vertcat(*(limit.value for limit in second.limits))
-    function = ca.Function("limits", [build_features(second.scene).z], [values])
+    function = ca.Function("limits", [elemental.build_features(second.scene).z], [values])
     assert np.isfinite(np.array(function(np.ones(5)))).all()
 
 

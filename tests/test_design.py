@@ -59,10 +59,8 @@ def test_a_symmetric_hand_mirrors_the_joint(box: Problem) -> None:
 
 @pytest.mark.parametrize("transcription", ["auto", "time"])
 def test_sensitivities_obey_dimensions(box: Problem, transcription: str) -> None:
-    """The least time scales with the units: sums of exponent times p dT/dp are 0, 0, T (Euler).
-
-    The file leaves out the object's inertia, which follows from mass and corners.
-    """
+    """The least time scales with the units: sums of exponent times p dT/dp are 0, 0, T (Euler)."""
+    # The file leaves out the object's inertia, which follows from mass and corners.
     names = [p.name for p in list_parameters(box) if p.name != "inertia"]
     options = PlanOptions(transcription=transcription)
     result = find_sensitivities(box, options, names, jobs=1)

@@ -22,14 +22,7 @@ from toys import plan_path
 from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark import refusals
 from wholearm.benchmark.refusals import judge
-from wholearm.common.errors import (
-    Change,
-    InfeasibleError,
-    InputError,
-    JammingError,
-    Parameter,
-    SolverError,
-)
+from wholearm.common import errors
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.limits import EPSILON
 from wholearm.planning import explain as explanation
@@ -60,7 +53,7 @@ def plan_all(problem: Problem, **options: Any) -> list[PhasePlan[TimeMotion]]:
 
 
 def why_not(plan: Callable[[], object]) -> str:
-    with pytest.raises(InfeasibleError) as caught:
+    with pytest.raises(errors.InfeasibleError) as caught:
         plan()
     return str(caught.value)
 
@@ -155,7 +148,7 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
     failed = explain_stages(search(problem), [], None)
-    assert isinstance(failed, SolverError)
+    assert isinstance(failed, errors.SolverError)
     text = str(failed)
     assert text.startswith("no plan for phases 1 and 2 (") and "found neither a plan nor" in text
     assert all(name in text for name in problem.phases[0].formation.names)
@@ -165,8 +158,8 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert "leave out --transcription time" in str(failed)
 
 
-def ask_plan(problem: Problem, **options: Any) -> InfeasibleError:
-    with pytest.raises(InfeasibleError) as caught:
+def ask_plan(problem: Problem, **options: Any) -> errors.InfeasibleError:
+    with pytest.raises(errors.InfeasibleError) as caught:
         solve(problem, **options)
     return caught.value
 
@@ -177,19 +170,19 @@ def pressing(epsilon: float) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def along() -> InfeasibleError:
+def along() -> errors.InfeasibleError:
     return ask_plan(pressing(6.0), intervals=20)
 
 
 @pytest.fixture(scope="module")
-def within() -> InfeasibleError:
+def within() -> errors.InfeasibleError:
     """In the time domain, from where a motion may begin."""
     return ask_shoved(EPSILON, 1.0)
 
 
 @pytest.mark.parametrize("which", ["along", "within"])
 def test_data_say_what_the_text_says(which: str, request: pytest.FixtureRequest) -> None:
-    error: InfeasibleError = request.getfixturevalue(which)
+    error: errors.InfeasibleError = request.getfixturevalue(which)
     assert error.shortfalls
     shares = [short.share for short in error.shortfalls]
     assert shares == sorted(shares, reverse=True)
@@ -201,7 +194,7 @@ def test_data_say_what_the_text_says(which: str, request: pytest.FixtureRequest)
         assert str(change) in str(error)
 
 
-def test_a_change_can_be_made(along: InfeasibleError) -> None:
+def test_a_change_can_be_made(along: errors.InfeasibleError) -> None:
     """By the keys that `with_` takes."""
     assert along.changes
     for change in along.changes:
@@ -213,7 +206,9 @@ def test_a_change_can_be_made(along: InfeasibleError) -> None:
         assert (change.value > own.value) == (own.sign > 0)
 
 
-def test_the_motion_that_misses_least_is_there(along: InfeasibleError, tmp_path: Path) -> None:
+def test_the_motion_that_misses_least_is_there(
+    along: errors.InfeasibleError, tmp_path: Path
+) -> None:
     motion = along.motion
     # What it is short of most is short by that much in its samples.
     worst = max((s for s in along.shortfalls if s.kind == "press"), key=lambda s: s.amount)
@@ -227,7 +222,7 @@ def test_the_motion_that_misses_least_is_there(along: InfeasibleError, tmp_path:
     assert any("misses limits least" in text for text in texts)
 
 
-def test_errors_pickle_with_their_data(along: InfeasibleError) -> None:
+def test_errors_pickle_with_their_data(along: errors.InfeasibleError) -> None:
     again = pickle.loads(pickle.dumps(along))
     assert str(again) == str(along) and again.changes == along.changes
     assert again.shortfalls == along.shortfalls
@@ -258,18 +253,18 @@ def slide(heptagon: Problem) -> Problem:
 
 def test_a_hand_that_is_too_weak_is_confirmed(slide: Problem) -> None:
     weak = slide.with_(WEAK)
-    verdict = judge(weak, InfeasibleError("phase 1 is infeasible"), [])
+    verdict = judge(weak, errors.InfeasibleError("phase 1 is infeasible"), [])
     assert verdict.kind == "confirmed" and "no motion keeps all limits" in verdict.reason
 
 
 def test_a_refusal_of_what_a_slow_motion_does_is_refuted(slide: Problem) -> None:
-    verdict = judge(slide, InfeasibleError("phase 1 is infeasible"), [])
+    verdict = judge(slide, errors.InfeasibleError("phase 1 is infeasible"), [])
     assert verdict.kind == "refuted" and "slow motion" in verdict.reason
 
 
 def test_jamming_is_confirmed_by_the_determinant(slide: Problem) -> None:
     rough = slide.with_({f"friction.{part}": 2.5 for part in ("palm", "finger1", "finger2")})
-    verdict = judge(rough, JammingError("phase 1 jams at x = ..."), [])
+    verdict = judge(rough, errors.JammingError("phase 1 jams at x = ..."), [])
     assert verdict.kind == "confirmed" and "uniqueness -" in verdict.reason
 
 
@@ -278,7 +273,7 @@ def test_the_event_that_ends_a_curve(until: str, kind: str) -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
     phases = [{**table["phases"][0], "until": until}]
     problem = build_problem({**table, "phases": phases})
-    verdict = judge(problem, InputError("", "phases[1].until", "is never reached"), [])
+    verdict = judge(problem, errors.InputError("", "phases[1].until", "is never reached"), [])
     assert verdict.kind == kind
 
 
@@ -290,19 +285,19 @@ def test_a_leg_through_a_cell(x: float, changes: dict[str, float], kind: str) ->
     """The object tips over its left vertex while it slides by `x`."""
     problem = tipping().with_(changes)
     stop = (float(problem.start[0]) + x, float(problem.start[2]) + 0.2)
-    verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
+    verdict = judge(problem, errors.InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == kind
 
 
 def test_a_leg_into_the_palm_has_no_end() -> None:
     problem = tipping(-13.0)
     stop = (float(problem.start[0]) + 0.01, float(problem.start[2]) - 0.2)
-    verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
+    verdict = judge(problem, errors.InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == "open" and "no place of its end" in verdict.reason
 
 
-STRONGEST = Parameter("torque limit of finger 2", 2.0, "N m", 1)
-PRESSING = Parameter("epsilon", 0.05, "N", -1)
+STRONGEST = errors.Parameter("torque limit of finger 2", 2.0, "N m", 1)
+PRESSING = errors.Parameter("epsilon", 0.05, "N", -1)
 
 
 def test_only_confirmed_changes_are_found() -> None:
@@ -310,28 +305,28 @@ def test_only_confirmed_changes_are_found() -> None:
     parameters = [STRONGEST, PRESSING, *(STRONGEST._replace(key=key) for key in ("2", "3"))]
     least = dict(zip(parameters, [2.341, 0.012, math.nan, 3.0], strict=True))
 
-    def can_plan(parameter: Parameter, value: float) -> bool:
+    def can_plan(parameter: errors.Parameter, value: float) -> bool:
         return parameter == STRONGEST or (parameter == PRESSING and value < 0.012)
 
-    def list_values(parameter: Parameter) -> list[float]:
+    def list_values(parameter: errors.Parameter) -> list[float]:
         return [] if math.isnan(least[parameter]) else list_beyond(parameter, least[parameter])
 
     changes = find_changes(parameters, list_values, can_plan)
-    assert changes == [Change(STRONGEST, 2.35), Change(PRESSING, 0.0119)]
+    assert changes == [errors.Change(STRONGEST, 2.35), errors.Change(PRESSING, 0.0119)]
     assert find_changes([PRESSING], lambda _: [math.nan, -0.01], lambda *_: True) == []
 
 
 @each("limit, values", [(STRONGEST, [3.0]), (PRESSING, [0.04]), (STRONGEST, []), (PRESSING, [])])
 @each("needed", [0.0, 0.013, 0.1, 0.49])
 def test_more_than_the_least_is_found_closely(
-    limit: Parameter, values: list[float], needed: float
+    limit: errors.Parameter, values: list[float], needed: float
 ) -> None:
     """Plans may need more than what limits at the nodes ask for, or nothing is known of them."""
     least = values[0] if values else limit.value
     border = least * (1 + limit.sign * needed)
     tried = list_beyond(limit, least) if values else [limit.value, least * (1 + limit.sign * 0.9)]
 
-    def can_plan(_: Parameter, value: float) -> bool:
+    def can_plan(_: errors.Parameter, value: float) -> bool:
         return limit.sign * (value - border) >= 0
 
     (change,) = find_changes([limit], lambda _: tried, can_plan)

@@ -325,10 +325,8 @@ def make_body(
     inertia: float = 1.0,
     weight: tuple[float, float] = (0.0, -G),
 ) -> System:
-    """One body (x, y, phi) of 1 kg, whose corners are given about its centroid.
-
-    A line is given by its distance from the origin and its normal, which points to the body.
-    """
+    """One body (x, y, phi) of 1 kg, whose corners are given about its centroid."""
+    # A line is given by its distance from the origin and its normal, which points to the body.
     z = ca.SX.sym("z", 3)
     c, s = ca.cos(z[2]), ca.sin(z[2])
     pairs = []

@@ -24,16 +24,10 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics import limits as limits_module
+from wholearm.mechanics import speed_sweep
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
 from wholearm.mechanics.path_limits import InternalForceLimits, PathLimits, find_speed_cap
-from wholearm.mechanics.speed_sweep import (
-    NoMotionError,
-    SweepMode,
-    find_duration,
-    make_cosine_grid,
-    speed_sweep,
-)
 from wholearm.planning.explain import change_limit, list_shortfalls
 from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
@@ -383,7 +377,7 @@ def solve_sweep(limits: PathLimits, steps: Array, part: Array, cap: Array) -> Ar
 def test_sweeps_are_solutions_of_a_linear_programme() -> None:
     """The set of feasible b is closed under maxima: one profile is largest at all nodes."""
     rng, count, solved = np.random.default_rng(8), 12, 0
-    steps, _, part = make_cosine_grid(count)
+    steps, _, part = speed_sweep.make_cosine_grid(count)
     every = []
     for _ in range(30):
         rows = rng.normal(size=(count, 5, 4)) * [0.0, 0.0, 0.3, 0.0]
@@ -395,17 +389,17 @@ def test_sweeps_are_solutions_of_a_linear_programme() -> None:
         best = solve_sweep(limits, steps, part, cap)
         if best is None:
             continue
-        found = speed_sweep(limits, steps, part, cap)
+        found = speed_sweep.speed_sweep(limits, steps, part, cap)
         assert found.b == pytest.approx(best, abs=1e-8)
         every.append((rows, cap, found))
         solved += 1
     assert solved > 15
     # Together they are the same as one by one.
     rows, cap = (np.stack([case[k] for case in every]) for k in range(2))
-    whole = speed_sweep(PathLimits(rows, cap[:, 1:]), steps, part, cap)
+    whole = speed_sweep.speed_sweep(PathLimits(rows, cap[:, 1:]), steps, part, cap)
     np.testing.assert_array_equal(whole.b, [case[2].b for case in every])
     np.testing.assert_array_equal(whole.modes, [case[2].modes for case in every])
-    times = [float(find_duration(case[2].b, steps)) for case in every]
+    times = [float(speed_sweep.find_duration(case[2].b, steps)) for case in every]
     assert whole.find_durations(steps) == pytest.approx(times, rel=1e-12)
 
 
@@ -421,11 +415,11 @@ def push() -> PathLimits:
 
 
 def test_half_the_path_is_for_speeding_up_and_half_for_braking() -> None:
-    found = speed_sweep(push(), STEPS, PART)
+    found = speed_sweep.speed_sweep(push(), STEPS, PART)
     # With s'' the same in each interval this motion is on the grid, where intervals are even.
-    assert find_duration(found.b, STEPS) == pytest.approx(2 * np.sqrt(LENGTH), rel=1e-9)
-    assert {*found.modes[: COUNT // 2 - 1]} == {SweepMode.PUSH}
-    assert {*found.modes[COUNT // 2 :]} == {SweepMode.BRAKE}
+    assert speed_sweep.find_duration(found.b, STEPS) == pytest.approx(2 * np.sqrt(LENGTH), rel=1e-9)
+    assert {*found.modes[: COUNT // 2 - 1]} == {speed_sweep.SweepMode.PUSH}
+    assert {*found.modes[COUNT // 2 :]} == {speed_sweep.SweepMode.BRAKE}
 
 
 @pytest.mark.filterwarnings("error")
@@ -435,10 +429,10 @@ def test_a_closed_place_lets_no_motion_pass(drag: float) -> None:
     limits.rows[..., V] = -drag
     limits.rows[closed, :, A], limits.rows[closed, :, ONE] = 0.0, -1.0
     both = PathLimits(np.stack([limits.rows, push().rows]), np.full((2, COUNT), np.inf))
-    found = speed_sweep(both, STEPS, PART, sweeps=2).find_durations(STEPS)
+    found = speed_sweep.speed_sweep(both, STEPS, PART, sweeps=2).find_durations(STEPS)
     assert found[0] == np.inf and np.isfinite(found[1])
-    with pytest.raises(NoMotionError):
-        speed_sweep(limits, STEPS, PART)
+    with pytest.raises(speed_sweep.NoMotionError):
+        speed_sweep.speed_sweep(limits, STEPS, PART)
 
 
 @pytest.mark.parametrize("cap", [3.0, 5.0])
@@ -448,10 +442,10 @@ def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
     rows[..., A], rows[..., ONE] = [1.0, -1.0], [[10.0, 10.0], [2.0, -2.0]]
     sweep = PathLimits(rows, np.full(2, cap)), np.ones(2), np.full(2, 0.5)
     if cap < 4.0:
-        with pytest.raises(NoMotionError):
-            speed_sweep(*sweep)
+        with pytest.raises(speed_sweep.NoMotionError):
+            speed_sweep.speed_sweep(*sweep)
     else:
-        assert speed_sweep(*sweep).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
+        assert speed_sweep.speed_sweep(*sweep).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
 
 
 def test_a_costate_that_falls_where_nothing_bounds_the_speed_ends_the_refinement() -> None:

@@ -114,10 +114,8 @@ def regular(count: int, radius: float) -> Array:
 
 
 def triangulate(corners: Array) -> tuple[float, Array, float]:
-    """Area, centroid and polar second moment about it, by midside quadrature on triangles.
-
-    The rule is exact for quadratics, and the second moment is one.
-    """
+    """Area, centroid and polar second moment about it, by midside quadrature on triangles."""
+    # The rule is exact for quadratics, and the second moment is one.
     area, first, points, weights = 0.0, np.zeros(2), [], []
     for one, two in pairwise(corners[1:]):
         triangle = np.array([corners[0], one, two])

@@ -50,10 +50,8 @@ EPSILON = 0.05
 
 
 def check_accuracy(toy: Toy, exact: float, best: int, **options: Any) -> None:
-    """Values are as accurate as asked, but for what choosing among equals costs, and say how much.
-
-    `best` is the sign of errors that would be better than the best, which none may be.
-    """
+    """Values are as accurate as asked, but for a choice among equals, and say how much."""
+    # `best` is the sign of errors that would be better than the best, which none may be.
     for accuracy in (1e-4, 1e-6):
         plan = toy.plan(accuracy=accuracy, **options)
         error = -best * (plan.value / exact - 1)
@@ -252,10 +250,8 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
 
 
 def least_shortfall(problem: Problem, phase: int, row: int) -> float:
-    """Least shortfall of one limit when all others hold, by a linear program at the start.
-
-    There b is 0 and a >= 0. Rows are c_n, then tau.
-    """
+    """Least shortfall of one limit when all others hold, by a linear program at the start."""
+    # There b is 0 and a >= 0. Rows are c_n, then tau.
     curve = trace_phases(problem)[phase]
     point, directions = curve.evaluate(np.zeros(1)), directions_of(curve, np.zeros(1, dtype=int))
     forces, limit = inverse(curve.formation, *point[:3], directions), problem.scene.torque_limit
@@ -516,10 +512,8 @@ def test_the_bound_shares_nothing_with_the_nlp() -> None:
 def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A flip after a slide until an edge is flush on finger 2 is slowest where a joint turns back.
-
-    Some of the grids are too coarse there for any motion, others for more than a crawl.
-    """
+    """A flip after a slide, until an edge is flush on finger 2, is slowest where a joint turns."""
+    # Some of the grids are too coarse there for any motion, others for more than a crawl.
     text = """
         epsilon = 0.05
         object.mass = 0.5

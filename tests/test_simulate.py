@@ -98,10 +98,8 @@ def test_finds_the_reversals_of_the_curve(index: int) -> None:
 
 
 def test_a_reversal_next_to_a_stop_turns_all_that_slides() -> None:
-    """A speed of rounding against the plan: where it ends, forces are those from rest.
-
-    A contact that hardly slides there has no event of its own.
-    """
+    """A speed of rounding against the plan: where it ends, forces are those from rest."""
+    # A contact that hardly slides there has no event of its own.
     problem, motion = pick(0)
     turn, scales = float(motion.turns[1]), problem.scene.scales
     sample = motion.evaluate(np.array([turn + 1e-7]))
@@ -371,10 +369,8 @@ def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
 
 @lru_cache(maxsize=4)
 def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
-    """The heptagon with low friction runs into its second formation at a speed along the curve.
-
-    The torques go on for a distance `beyond` the impact [m], and then step.
-    """
+    """The heptagon with low friction runs into its second formation at a speed along the curve."""
+    # The torques go on for a distance `beyond` the impact [m], and then step.
     problem = problem_of(HEPTAGON).with_({"phases[1].end": "impact"})
     problem = dataclasses.replace(problem, phases=problem.phases[:2])
     curve = trace_phases(problem)[0]

@@ -25,13 +25,8 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import solve_impulses
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
+from wholearm.simulation import modes
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import (
-    StartDeparture,
-    find_rest,
-    find_standstill,
-    maximise_margin,
-)
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:
@@ -48,11 +43,9 @@ def test_replay_keeps_the_vertex_where_it_is() -> None:
 
 
 def fall(mu: float, lean: float) -> tuple[float, float, float]:
-    """When and how far a box that falls from rest about its vertex has leant when that slips.
-
-    Returns the time [s], the lean [rad] and the tangential force [N] from the conservation of
-    energy: l is the distance of the centroid from the vertex.
-    """
+    """When and how far a box that falls from rest about its vertex has leant when that slips."""
+    # Returns the time [s], the lean [rad] and the tangential force [N] from the conservation of
+    # energy: l is the distance of the centroid from the vertex.
     body = make_scene(POINTS).polygon
     assert body.inertia is not None
     length = float(np.hypot(*body.vertices[1]))
@@ -86,10 +79,8 @@ def fall(mu: float, lean: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("mu, sign", [(0.25, 1.0), (0.36, 1.0), (0.6, -1.0)])
 def test_a_falling_box_keeps_its_vertex_until_its_cone_is_left(mu: float, sign: float) -> None:
-    """In closed form, whether the vertex has to roll, may slide, or does one after the other.
-
-    On rough ground it slips forwards, on smooth ground backwards.
-    """
+    """In closed form, whether the vertex has to roll, may slide, or does one after the other."""
+    # On rough ground it slips forwards, on smooth ground backwards.
     problem = falling(mu, 0.2)
     rolling = problem.phases[0].formation
     sliding = replace(rolling, rolling=())
@@ -554,14 +545,14 @@ def landing_from_rest() -> Problem:
 def test_start_with_two_freedoms() -> None:
     moving, rng = landing_from_rest(), np.random.default_rng(3)
     (phase,), z = moving.phases, moving.start
-    rest, seen = find_rest(phase.formation, z), 0
+    rest, seen = modes.find_rest(phase.formation, z), 0
     assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
     assert len(list(rest.list_modes())) == 2**5 + 5 * 2**4
     while seen < 3:
         tau = np.array([1.0, -1.0]) * rng.uniform(0.0, 2.0, size=2)
         change_of_state = rest.wait(tau[:, None], -1.0)
-        if not isinstance(change_of_state, StartDeparture):
+        if not isinstance(change_of_state, modes.StartDeparture):
             continue
         directions = Directions(*np.split(change_of_state.signs, [-2]))
         if not all(map(np.all, directions)):
@@ -618,17 +609,17 @@ def test_a_start_shows_once_its_acceleration_exceeds_rounding() -> None:
     problem = problem_of(HEXAGON).with_({"vertices": corners, "start": start, "phases": phases})
     torques = [[0.1185525643378136, 0.04320277349437667, -0.00030286699521259175]]
     torques += [[-1.1310188153889746, -0.5855907965602957, 7.361256049165377e-11]]
-    rest = find_rest(problem.phases[0].formation, problem.start)
+    rest = modes.find_rest(problem.phases[0].formation, problem.start)
     departure = rest.wait(np.array(torques), -1.0)
-    assert isinstance(departure, StartDeparture) and departure.x < -1 + 1e-5
+    assert isinstance(departure, modes.StartDeparture) and departure.x < -1 + 1e-5
 
 
 def test_what_is_beyond_the_end_of_a_link_does_not_touch() -> None:
     problem = problem_of(HEXAGON)
     phase = replace(problem.phases[0], until=Until(Contact("v", 3, "finger", 1)))
-    place = find_standstill(problem, phase, problem.start)
+    place = modes.find_standstill(problem, phase, problem.start)
     assert set(place.touching.names) == {*phase.formation.names, "v2-finger1"}
-    assert maximise_margin(np.ones(2), np.array([[-np.inf, 1.0, 0.0]])) is None
+    assert modes.maximise_margin(np.ones(2), np.array([[-np.inf, 1.0, 0.0]])) is None
 
 
 @pytest.mark.parametrize("early", (1e-7, 5e-7))
@@ -644,10 +635,8 @@ def test_of_breaks_near_each_other_a_phase_ends_at_the_nearest(early: float) -> 
 
 @pytest.mark.parametrize("until", ["e4-tip2", "e5-tip2"])
 def test_a_pointed_tip_gains_either_edge_at_a_vertex(until: str) -> None:
-    """The hexagon slides until v5 is at the tip of a short finger 2, and back.
-
-    Both edges touch the tip there, and the motion back opens both.
-    """
+    """The hexagon slides until v5 is at the tip of a short finger 2, and back."""
+    # Both edges touch the tip there, and the motion back opens both.
     contacts = ["v0-palm", "v1-palm", "v3-finger1", "v5-finger2"]
     phases = [{"contacts": contacts, "until": end} for end in (until, {"x": -0.025})]
     changes = {"length1": 0.18, "length2": 0.057, "radius": 0.0, "x": -0.03, "phases": phases}

@@ -22,18 +22,10 @@ from wholearm.benchmark.stress import check_plan as check_again
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
+from wholearm.planning import replay_check
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.plan import solve
-from wholearm.planning.replay_check import (
-    RESIDUAL,
-    ReplayCheck,
-    check_plan,
-    find_residual,
-    make_table,
-    replay_plan,
-    sample_table,
-)
 from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import Balance, balance
@@ -58,10 +50,8 @@ def units(scene: Scene) -> Array:
 
 
 def test_virtual_power() -> None:
-    """Contacts do the power of c_n on gaps that open and of c_t on what slides, for any motion.
-
-    States and forces obey no equation, but friction opposes the sliding.
-    """
+    """Contacts do the power of c_n on gaps that open and of c_t on what slides, for any motion."""
+    # States and forces obey no equation, but friction opposes the sliding.
     scene, rng, count = scene_of(), np.random.default_rng(5), 30
     formation = make_formation(scene, CONTACTS)
     z = rng.uniform(-1, 1, (count, 5)) * [0.05, 0.05, 1.0, 0.5, 0.5] + [0, 0.05, 0, 1.2, 1.9]
@@ -484,7 +474,7 @@ def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
 
 def test_a_table_holds_like_its_plan() -> None:
     problem, trajectory = plan()
-    table = make_table(problem, trajectory)
+    table = replay_check.make_table(problem, trajectory)
     report = verify(problem, read_rows(table.rows))
     assert report.ok and report.warnings == ()
     figures = table.figures
@@ -501,16 +491,16 @@ def test_a_table_that_loses_a_contact_is_an_error() -> None:
     problem, trajectory = plan()
     weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
     with pytest.raises(ReplayError, match=r"do not hold in their replay: c_n of .* phase 2"):
-        make_table(problem, weak)
-    assert make_table(problem, weak, replay=False).figures["replay"] is None
+        replay_check.make_table(problem, weak)
+    assert replay_check.make_table(problem, weak, replay=False).figures["replay"] is None
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
 def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     """The closer the samples, the nearer arrivals and forces are to those of the plan."""
     problem, trajectory = plan()
-    fine = sample_table(problem, trajectory, 8000.0, interpolation).figures
-    coarse = sample_table(problem, trajectory, 60.0, interpolation).figures
+    fine = replay_check.sample_table(problem, trajectory, 8000.0, interpolation).figures
+    coarse = replay_check.sample_table(problem, trajectory, 60.0, interpolation).figures
     assert (fine["sample_rate"], fine["interpolation"]) == (8000.0, interpolation)
     assert not coarse["replay"]["ok"] and " phase " in coarse["replay"]["reason"]
 
@@ -523,21 +513,21 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     # What is d off at its end arrives sqrt(2 d / a) early: half a period of delay takes 4 ms.
     assert (find_errors(fine) < [0.02, 0.02]).all()
     assert find_errors(coarse).sum() > 2 * find_errors(fine).sum()
-    unplayed = sample_table(problem, trajectory, 60.0, interpolation, replay=False)
+    unplayed = replay_check.sample_table(problem, trajectory, 60.0, interpolation, replay=False)
     assert unplayed.figures["replay"] is None
 
 
 def test_a_plan_that_holds_and_torques_that_do_not_carry_the_motion() -> None:
     problem, trajectory = plan()
-    check = check_plan(problem, trajectory, Allowance())
-    harsh = check_plan(problem, trajectory, Allowance(departure=1e-15))
+    check = replay_check.check_plan(problem, trajectory, Allowance())
+    harsh = replay_check.check_plan(problem, trajectory, Allowance(departure=1e-15))
     assert harsh.failure is not None and " departs from the plan, by " in harsh.failure[1]
     assert check.failure is None and check.residual.size < 1e-9
     assert isinstance(check.report, Report)
     # Every piece is a step, and few end elsewhere.
     assert check.report.steps < 2 * len(trajectory.torque.coefficients) + 150
     weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
-    check = check_plan(problem, weak, Allowance())
+    check = replay_check.check_plan(problem, weak, Allowance())
     assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
     # The first phase departs by the braking that it lacks.
     assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
@@ -549,13 +539,13 @@ def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
     dry = problem.scene.dry[4]
     tau[rows, 1] -= 2 * dry * np.sign(trajectory.theta_dot[rows, 1])
     wrong = replace(trajectory, tau=tau)
-    found = find_residual(problem, wrong)
+    found = replay_check.find_residual(problem, wrong)
     assert found.phase == 3
     assert found.size == pytest.approx(2 * dry / problem.scene.scales.torque, rel=1e-6)
     assert "finger 2" in found.text and "as joint 2 moves against the sense" in found.text
     times = [f"at t = {t:.5g} s, phase 3" for t in trajectory.t[rows]]
     assert any(found.text.endswith(time) for time in times)
-    check = check_plan(problem, wrong, Allowance())
+    check = replay_check.check_plan(problem, wrong, Allowance())
     assert check.failure == (3, found.text)
 
 
@@ -565,7 +555,7 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     slide = part_of(problem_of(HEPTAGON), 0, 1)
     easy = replace(slide, epsilon=slide.epsilon - short)
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
-    held, figures = replay_plan(replace(planning, problem=slide), lambda _: None)
+    held, figures = replay_check.replay_plan(replace(planning, problem=slide), lambda _: None)
     assert figures.least_c_n.value > slide.epsilon
     assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
     assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
@@ -575,8 +565,10 @@ def test_a_plan_that_jams_in_its_replay_is_refused(monkeypatch: pytest.MonkeyPat
     error = JammingError("v1-palm jams in phase 2 at t = 0.1 s")
     error.phase = 2
 
-    def replay(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> ReplayCheck:
-        return check_plan(problem, trajectory, allowance)._replace(report=error)
+    def replay(
+        problem: Problem, trajectory: Trajectory, allowance: Allowance
+    ) -> replay_check.ReplayCheck:
+        return replay_check.check_plan(problem, trajectory, allowance)._replace(report=error)
 
     monkeypatch.setattr(self_check, "check_plan", replay)
     with pytest.raises(ReplayError) as caught:
@@ -600,7 +592,7 @@ def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> No
         for key in ("end_deviation", "deviation"):
             assert max(own[key]["m"], own[key]["rad"]) < Allowance().departure
         assert own["end_speed"] < Allowance().rest_speed * heptagon.scene.scales.speed
-    assert figures["residual"] < RESIDUAL
+    assert figures["residual"] < replay_check.RESIDUAL
 
 
 def test_a_contact_that_is_let_go_counts_until_then() -> None:

@@ -12,13 +12,7 @@ import casadi as ca
 from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Store
 from ..scene.model import Scene
-from .elemental import (
-    Contact,
-    GapLimit,
-    build_features,
-    build_once,
-    candidate_contacts,
-)
+from .elemental import Contact, GapLimit, build_features, build_once, candidate_contacts
 
 FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
 ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points

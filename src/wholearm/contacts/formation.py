@@ -23,14 +23,7 @@ from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
-from .elemental import (
-    Contact,
-    GapLimit,
-    build_features,
-    build_once,
-    build_pair,
-    candidate_contacts,
-)
+from .elemental import Contact, GapLimit, build_features, build_once, build_pair, candidate_contacts
 
 
 class Kinematics(NamedTuple):

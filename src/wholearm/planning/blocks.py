@@ -146,10 +146,7 @@ def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 
 
 def plan_next(
-    planning: Planning,
-    known: BlockPlan | None,
-    report: Callable[[str], None],
-    coarse: bool = False,
+    planning: Planning, known: BlockPlan | None, report: Callable[[str], None], coarse: bool = False
 ) -> Planning:
     """Plan the next block, in the time domain coarsely if asked, unless `known` is its plan.
 

@@ -29,14 +29,7 @@ from ..problem.definition import Goal, Phase, Problem
 from ..scene.model import Scene
 from .astar import EAGER, NEARBY, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
-from .edges import (
-    DEPENDENT,
-    Blocked,
-    Edge,
-    describe_steps,
-    edge_along,
-    point_out,
-)
+from .edges import DEPENDENT, Blocked, Edge, describe_steps, edge_along, point_out
 from .places import make_place, require_reach
 from .roadmap import Roadmap
 

@@ -33,11 +33,7 @@ PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 
 
-@declare(
-    key("departure", kind=POSITIVE),
-    key("rest_speed", kind=POSITIVE),
-    UNIQUENESS,
-)
+@declare(key("departure", kind=POSITIVE), key("rest_speed", kind=POSITIVE), UNIQUENESS)
 @dataclass(frozen=True)
 class Allowance:
     """What a replay may differ by from what is asked and still hold.

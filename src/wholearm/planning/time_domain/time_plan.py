@@ -44,16 +44,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import (
-    Scheme,
-    Stage,
-    in_own_units,
-    make_scheme,
-    resample,
-    to_si,
-    unit_of,
-    with_controls,
-)
+from .stage import Scheme, Stage, in_own_units, make_scheme, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -132,9 +123,7 @@ def plan_phases(
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
         solution = solve_guesses(
-            search,
-            listed,
-            lambda: refuse(search, guesses.nearest.stages, explanation),
+            search, listed, lambda: refuse(search, guesses.nearest.stages, explanation)
         )
     if solution is None and _can_last(search, stages):
         raise SolverError(
