@@ -45,7 +45,7 @@ from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_nlp, time_plan
 from wholearm.planning.time_domain.guesses import NEAREST, Guess, guess_stages, list_stages
-from wholearm.planning.time_domain.mode_search import drop, link
+from wholearm.planning.time_domain.mode_search import drop, in_mode, link, mode_of
 from wholearm.planning.time_domain.solution import (
     ITERATIONS,
     SETTINGS,
@@ -654,11 +654,15 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     check_friction(plan.motion.stages)
 
 
-def test_without_the_first_stage_a_motion_begins_where_it_did() -> None:
+def test_changed_stages_begin_and_end_where_they_did() -> None:
     stages = list_stages(plan_landing(time_intervals=COARSE, replay=False))
     last = [stage for stage in stages if stage.phase == stages[-1].phase]
     left = drop(last, 0)
     assert left and np.array_equal(left[0].guess.nodes[0], last[0].guess.nodes[0])
+    # A given end determines a pose in modes without freedoms, too.
+    stuck, end = in_mode(last[-1], (0.0,) * len(mode_of(last[-1]))), last[-1].guess.nodes[-1, 0]
+    (stage,) = Guess("", [stuck]).end_at(end, in_own_units(landing())).stages
+    assert stage.stop is not None and np.isfinite(stage.stop).sum() == 2
 
 
 def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:

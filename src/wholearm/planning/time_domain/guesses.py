@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby, pairwise
+from itertools import combinations, groupby, pairwise
 from operator import truediv
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from ...geometry.curve import describe_pose, find_tied, tangent_basis
 from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, is_inside, list_ends
 from ...mechanics.dynamics import Directions, close_contacts, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
-from ...problem.definition import End, Phase
+from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
 from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan
@@ -65,9 +65,18 @@ class Guess(NamedTuple):
     homotopy: bool = False  # whether its modes come from the friction homotopy
     before: TimeSolution | None = None  # solution that the stages are from
 
-    def end_at(self, z: Array) -> Guess:
-        """The same with a given end, shape (5,)."""
-        return self._replace(stages=[replace(stage, stop=z) for stage in self.stages])
+    def end_at(self, z: Array, problem: Problem) -> Guess:
+        """The same with a given end, shape (5,).
+
+        Given are the coordinates that determine z well, those of the object first, whatever rolls
+        in the end: the largest margin of `hexagon.toml` may end in a mode without freedoms.
+        """
+        N = tangent_basis(problem.phases[self.stages[-1].phase].formation, z)
+        choices = [list(rows) for rows in combinations((0, 2, 1, 3, 4), N.shape[1])]
+        sizes = np.array([abs(np.linalg.det(N[rows])) for rows in choices])
+        pinned, stop = choices[int(np.argmax(sizes > 0.1 * sizes.max()))], np.full(5, np.nan)
+        stop[pinned] = z[pinned]
+        return self._replace(stages=[replace(stage, stop=stop) for stage in self.stages])
 
     @property
     def rests(self) -> bool:

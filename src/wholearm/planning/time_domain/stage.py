@@ -144,7 +144,8 @@ class Stage:
     apart: tuple[int, ...] = ()  # limits as clear at the end, as the next phase closes them
     # row of z, its value where the phase ends, and the side from which it comes there
     ahead: tuple[int, float, float] | None = None
-    stop: Array | None = None  # (5,): the given end of the last one of all stages
+    # (5,): coordinates of the given end of the last one of all stages, NaN for those that follow
+    stop: Array | None = None
     periods: tuple[int, ...] = ()  # control period of each interval, if torques are held
     # duration of a control period, in the scene's unit; 0 if all are equal and of any duration
     period: float = 0.0

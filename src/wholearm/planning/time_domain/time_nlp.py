@@ -333,9 +333,9 @@ def add_stage(
     # The end.
     until, (end_z, end_v) = stage.until, layout.nodes[-1]
     if last and stage.stop is not None:
-        until, N = None, tangent_basis(formation, stage.stop)
-        there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
-        rows.add_entries(there[:, None], end_z, N.T)
+        until, pinned = None, np.flatnonzero(np.isfinite(stage.stop))
+        there = rows.linear(len(pinned), low=stage.stop[pinned], high=stage.stop[pinned])
+        rows.add_entries(there, end_z[pinned], 1.0)
     turns, gained_softly = _list_free_turns(stage), stage.gained
     if stops(stage):
         turns, gained_softly = (), None

@@ -162,7 +162,7 @@ def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -
     """
     last = guess.stages[-1]
     if fastest and search.goal is Objective.MARGIN:
-        guess = guess.end_at(fastest[-1].guess.nodes[-1, 0])
+        guess = guess.end_at(fastest[-1].guess.nodes[-1, 0], search.problem)
     if search.to_go is not None:
         with suppress(WholearmError):
             search = replace(search, price=search.expand(last.guess.nodes[-1, 0])[1])
@@ -547,7 +547,8 @@ def _list_slow(
             coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
         guesses = chain(islice(guesses, 1), [Guess("a motion of least time", coarse)], guesses)
     for guess in guesses:
-        yield guess.end_at(fastest[-1].guess.nodes[-1, 0]) if pinned and fastest else guess
+        end = fastest[-1].guess.nodes[-1, 0] if pinned and fastest else None
+        yield guess if end is None else guess.end_at(end, search.problem)
 
 
 def _can_last(search: TimeSearch, stages: Sequence[Stage]) -> bool:
