@@ -211,21 +211,26 @@ def search_release(
     best: CoarsePlan,
     to_go: CostToGo | None = None,
     known: Mapping[RefinedPath, CoarsePlan | None] = MappingProxyType({}),
+    go_on: Callable[[CoarsePlan], CoarsePlan | None] = lambda _: None,
 ) -> list[CoarsePlan]:
     """Pattern search for the place where an edge leaves a border: the fastest plan, then others.
 
     By the least time of the edge and of a border that follows where it lands (`to_go`); `known` are
-    plans that were made before.
+    plans that were made before. From the fastest one with a stop `go_on` plans one without.
     """
     least, tried, others = time_with(to_go, best), {RefinedPath(0)}, list[CoarsePlan]()
 
     def gains(path: RefinedPath) -> bool:
         """Plan a path that has not been tried; whether it is the fastest one."""
-        nonlocal best, least
         if path in tried:
             return False
         tried.add(path)
-        if (made := known[path] if path in known else plan(path)) is None:
+        return accept(known[path] if path in known else plan(path))
+
+    def accept(made: CoarsePlan | None) -> bool:
+        """Keep a plan, if it is one; whether it is the fastest."""
+        nonlocal best, least
+        if made is None:
             return False
         time = time_with(to_go, made)
         better = time < GAIN * least
@@ -248,6 +253,8 @@ def search_release(
         path = shift(RefinedPath(0), STEPS)
         if gains(path._replace(straight=False)):
             shift(path._replace(straight=False), STEPS[1:])
+        # Cases: goal 16 of the corpus, 8 % faster.
+        accept(go_on(best))
     return [best, *others]
 
 
@@ -460,7 +467,8 @@ class RoutePlanner:
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
-            searches[edge] = partial(search_release, partial(self._release, edge), plan, to_go)
+            release, go_on = partial(self._release, edge), partial(self._go_on, edge)
+            searches[edge] = partial(search_release, release, plan, to_go, go_on=go_on)
         roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
@@ -480,9 +488,15 @@ class RoutePlanner:
         if place is not None and not INSIDE < place < 1 - INSIDE:
             return None
         # In motion the first guess has no plan in goal 48 of the corpus.
-        guesses = {"straight": path.straight, "first_only": place is not None}
-        steps = leave_at(edge, place)
-        return plan_coarsely(self.problem, edge, steps, self.options, **guesses)
+        steps, first_only = leave_at(edge, place), place is not None
+        return plan_coarsely(
+            self.problem, edge, steps, self.options, straight=path.straight, first_only=first_only
+        )
+
+    def _go_on(self, edge: Edge, stopped: CoarsePlan) -> CoarsePlan | None:
+        """Plan an edge that leaves its border in motion from a plan that stops there."""
+        steps = leave_at(edge, None)
+        return plan_coarsely(self.problem, edge, steps, self.options, stopped=stopped)
 
     def _is_lost(self, route: Route) -> bool:
         """Whether a route contains edges that had no plan on another one."""

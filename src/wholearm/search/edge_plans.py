@@ -91,6 +91,7 @@ def plan_coarsely(
     further: bool = False,
     straight: bool = True,
     first_only: bool = False,
+    stopped: CoarsePlan | None = None,
 ) -> CoarsePlan | None:
     """Plan an edge through a cell alone, on few intervals; None if there is no plan.
 
@@ -100,6 +101,7 @@ def plan_coarsely(
     further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried
+    stopped     a plan that stops where it leaves the border, as guess of one that does not
     """
     from ..planning.time_domain.time_plan import try_phases
 
@@ -119,7 +121,14 @@ def plan_coarsely(
             return None  # `until` holds already where it starts.
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only)
+        given = list[PhasePlan[TimeMotion]]()
+        if stopped is not None:
+            (first,) = make_phases(problem, stopped.steps[:1])
+            before = try_phases(replace(single, phases=(first,)), [first], z, rough)
+            if before is None:
+                return None
+            given = [*before, *stopped.begun]
+        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only, given)
     except (WholearmError, np.linalg.LinAlgError):
         return None
     if plans is None:

@@ -213,6 +213,21 @@ class Guesses:
             stages += divide(stage, parts)
         return Guess("the plan along curves", self._leave_room(link(stages)))
 
+    def without_stops(self, plans: Sequence[PhasePlan[Motion]]) -> Guess:
+        """Along plans of the phases, each of them from rest to rest."""
+        stages = [
+            replace(
+                stage,
+                phase=own.phase,
+                goal=own.goal,
+                released=own.released,
+                monitored=tuple(sorted({*stage.monitored, *own.released})),
+            )
+            for own, plan in zip(join_modes(self.nearest.stages), plans, strict=True)
+            for stage in list_stages([plan])
+        ]
+        return self.resume("a motion with stops between the phases", link(stages))
+
     def with_earlier_releases(self) -> Iterator[Guess]:
         """To the nearest ends, with a contact released one mode earlier.
 

@@ -235,6 +235,7 @@ def try_phases(
     goal: Array | None = None,
     further: bool = False,
     single_guess: bool = False,
+    stopped: Sequence[PhasePlan[TimeMotion]] = (),
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
@@ -243,12 +244,15 @@ def try_phases(
     goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
     further       whether guesses after the first ones are tried
     single_guess  whether to solve from one guess alone
+    stopped       plans of the phases, each from rest to rest, as the only guess
     """
     rough = replace(options, mode_search=False)
     search = TimeSearch.of(problem, rough, phases, only_begins=True)
     guesses = Guesses(search, z)
     listed: Iterable[Guess] = guesses.every(goal)
-    if single_guess:
+    if stopped:
+        listed = [guesses.without_stops(stopped)]
+    elif single_guess:
         # The nearest end is another guess than a straight path that limits exclude.
         single = guesses.nearest if goal is None else guesses.straight(goal)
         listed = [single] if single else []
