@@ -304,6 +304,7 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     found, *others = search_release(plan, edge_plans.CoarsePlan(1 + FINEST * abs(best), (), []))
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
+    assert search_release(plan, found, go_on=lambda one: one._replace(duration=0.9))[0].duration < 1
 
 
 def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
