@@ -50,9 +50,7 @@ from .time_motion import TimeMotion, make_phase_motions
 if TYPE_CHECKING:
     from ..explain import Replan
 
-# Duration, over a period, that counts as zero. Case: new polygon 22 with 2 ms, whose phase 1 would
-# take 1.5 % of its last period; less than 1 nm from its end its replay takes that for the end.
-_BRIEF = 2e-2
+_BRIEF = 1e-3  # duration, over a period, that counts as zero
 
 
 def plan_phases(
