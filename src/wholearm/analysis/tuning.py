@@ -374,8 +374,7 @@ class PassageTuner:
         self, problem: Problem, passage: Passage, z: Array, options: TuningOptions
     ) -> None:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
-        until = passage.until.lead(z, problem.scene.scales.length)
-        self.end = EndDistance(problem.scene, until, z)
+        self.end = EndDistance.to_leading(problem.scene, passage.until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
         self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
         self.limit, scales = problem.scene.torque_limit, problem.scene.scales

@@ -231,6 +231,11 @@ class EndDistance:
         self.row, value = until.poses[0] if until.value is not None else (0, math.nan)
         self.value, self.side = value, math.copysign(1.0, start[self.row] - value)
 
+    @staticmethod
+    def to_leading(scene: Scene, until: Until, start: Array) -> EndDistance:
+        """Distance to the end by the coordinate with the longest way from the start."""
+        return EndDistance(scene, until.lead(start, scene.scales.length), start)
+
     def evaluate(self, z: Array, v: Array) -> tuple[Array, Array, Array]:
         """Distance at n states, (n,), its gradient, (n, 5), and its bend, (n,).
 

@@ -244,9 +244,8 @@ def _find_end(
         closed = [s for s in simulation.stretches if s.contact == until.contact.name]
         times += [max(s.start, start) for s in closed if s.stop > start]
     elif until.value is not None:
-        z, scene = simulation.z[rows], simulation.problem.scene
-        until = until.lead(z[0], scene.scales.length)
-        reached = EndDistance(scene, until, z[0]).measure(z) <= 0
+        z = simulation.z[rows]
+        reached = EndDistance.to_leading(simulation.problem.scene, until, z[0]).measure(z) <= 0
         times = simulation.t[rows[reached][:1]].tolist()
     else:
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]

@@ -14,6 +14,7 @@ from ..common.fields import POSITIVE, declare, key, read_keys
 from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import describe_pose
+from ..geometry.tracing import EndDistance
 from ..mechanics import UNIQUENESS
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
@@ -83,8 +84,7 @@ def describe_failures(
             if scene.scales.length * turns[fastest] > speed:
                 body = ("the object", "finger 1", "finger 2")[fastest]
                 moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
-            until = phase.until.lead(simulation.z[first], scene.scales.length)
-            unit = "rad" if until.coordinate == "phi" else "m"
+            unit = EndDistance.to_leading(scene, phase.until, simulation.z[first]).unit
             text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
                 f"{event.value:.3g} {unit}/s at t = {event.time:.5g} s, while {moves}, with "

@@ -549,10 +549,10 @@ def _examine_loss(
         row = int(rows[simulation.t[rows] <= time][-1])
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
-    scene, start, distance = problem.scene, simulation.z[rows[0]], None
+    distance = None
     if not phase.until.is_release:
-        until = phase.until.lead(start, scene.scales.length)
-        distance = EndDistance(scene, until, start).evaluate(z[None], v[None])
+        end = EndDistance.to_leading(problem.scene, phase.until, simulation.z[rows[0]])
+        distance = end.evaluate(z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
@@ -627,7 +627,7 @@ def find_approach(simulation: Simulation) -> results.Approach | None:
     if phase.until.is_release:
         return None
     t, z, v = simulation.t[rows], simulation.z[rows], simulation.z_dot[rows]
-    end = EndDistance(problem.scene, phase.until.lead(z[0], scales.length), z[0])
+    end = EndDistance.to_leading(problem.scene, phase.until, z[0])
     gaps, gradient, _ = end.evaluate(z, v)
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps)
