@@ -147,8 +147,11 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    failed = explain_stages(search(problem), [], None)
+    place = errors.LimitPlace(1, 0.1, "t = 0.1 s, phase 1")
+    missed = [errors.Shortfall("press", "v1-palm", "c_n", 2.0, "N", place, k) for k in (0.1, 0.2)]
+    failed = explain_stages(search(problem), [], None, missed)
     assert isinstance(failed, errors.SolverError)
+    assert "; where it stopped, c_n is 2 N short at t = 0.1 s, phase 1; try" in str(failed)
     text = str(failed)
     assert text.startswith("no plan for phases 1 and 2 (") and "found neither a plan nor" in text
     assert all(name in text for name in problem.phases[0].formation.names)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -460,6 +461,25 @@ def test_a_worse_optimum_than_along_the_curve_is_not_kept(monkeypatch: pytest.Mo
     slide = shipped.part_of(shipped.problem_of(shipped.HEPTAGON), 2, 3)
     along, whole = (solve(slide, transcription=t, replay=False).value for t in ("auto", "time"))
     assert whole == pytest.approx(along, rel=1e-3)
+
+
+def test_guesses_after_the_homotopy_are_refined_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Case: scene 486 of the stress study, seed 1128: its coarse plans are lost when refined."""
+    refined = list[str]()
+
+    def solve_coarse(_: TimeSearch, guess: Guess, most: int) -> Any:
+        return SimpleNamespace(success=guess.name > "b", name=guess.name, most=most)
+
+    monkeypatch.setattr(time_plan, "solve_coarse", solve_coarse)
+    monkeypatch.setattr(time_plan, "may_gain", lambda *_: True)
+    monkeypatch.setattr(time_plan, "is_same", lambda *_: False)
+    monkeypatch.setattr(
+        time_plan, "_refine_best", lambda _, all: refined.extend(x.name for x in all)
+    )
+    guesses = [Guess(name, [], homotopy=name == "b") for name in "abcd"]
+    slide = shipped.problem_of(shipped.BOX)
+    assert time_plan.solve_guesses(TimeSearch.of(slide, PlanOptions()), guesses) is None
+    assert refined[:2] == ["c", "d"]
 
 
 def test_a_part_of_a_block_starts_at_rest() -> None:

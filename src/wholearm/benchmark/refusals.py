@@ -396,15 +396,17 @@ class Verdict(NamedTuple):
 def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float]]) -> Verdict:
     """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi).
 
-    Phases after one with two freedoms begin where the least-time plan of the phases before ends.
+    Phases after one with two freedoms begin where the least-time plan of the phases before ends. A
+    refusal of several is confirmed by that of any, and refuted by a motion of all.
     """
-    match = re.search(r"phases? (\d+)|phases\[(\d+)\]", str(error))
-    number = int(match[1] or match[2]) if match else None
+    match = re.search(r"phases?[ \[](\d+)(?: and (\d+)| to (\d+))?", str(error))
+    number = int(match[1]) if match else None
+    last = int(match[2] or match[3] or match[1]) if match else len(problem.phases)
     z = problem.start
     open_end = Verdict("open", "")
     planned = False
     for phase in problem.phases:
-        concerned = number in (None, phase.number)
+        concerned = (number or 1) <= phase.number <= last
         if planned and not concerned:
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
@@ -419,7 +421,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
             if concerned:
                 verdict = _judge_curve(problem, phase, trace)
-                if verdict.kind != "refuted" or number is not None:
+                if verdict.kind != "refuted" or phase.number == last:
                     return verdict
                 open_end = verdict
             z = trace.end

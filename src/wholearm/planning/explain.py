@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -509,18 +509,24 @@ def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
 
 
 def explain_stages(
-    search: TimeSearch, short: Sequence[list[Stage]], replan: Replan | None
+    search: TimeSearch,
+    short: Sequence[list[Stage]],
+    replan: Replan | None,
+    missed: Sequence[Shortfall] = (),
 ) -> InfeasibleError | SolverError:
     """Why phases over time have no plan, and what would change that.
 
-    `short` are elastic solutions that violate limits, from different guesses. Without `replan` no
-    change is looked for.
+    `short` are elastic solutions that violate limits, from different guesses; without any, `missed`
+    are violations where the last elastic solve stopped. Without `replan` no change is looked for.
     """
     problem, phases, numbers = search.source, search.phases, search.numbers
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         where = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until})"
         text = f"{where}: the solver found neither a plan nor a motion that misses limits least"
+        if missed:
+            worst = max(missed, key=attrgetter("share"))
+            text += f"; where it stopped, {worst}"
         usual = search.options.transcription == "time" and not problem.scene.control_period
         if usual and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")

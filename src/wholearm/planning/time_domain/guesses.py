@@ -263,9 +263,12 @@ class Guesses:
         return sorted((path for path in paths if path[0].value > -np.inf), key=rank)
 
     def to_others(self) -> Iterator[Guess]:
-        """Along the first of these paths."""
+        """Along the first of these paths, and along the one with the largest margin."""
         name = "a motion straight to another end"
-        return (self._follow(name, outline) for _, outline in self.paths[:3])
+        best = int(np.argmax([margin.value for margin, _ in self.paths] or [0.0]))
+        # No plan is found from the first of them in scene 327 of the stress study, seed 1128.
+        others = [path for k, path in enumerate(self.paths) if k < 3 or k == best]
+        return (self._follow(name, outline) for _, outline in others)
 
     def _is_planar(self) -> bool:
         """Whether there is a single phase, with two freedoms, that does not end by a release."""
@@ -306,6 +309,15 @@ class Guesses:
         if not given:
             yield from self.to_others()
             yield Guess(LONGER, self._guess(falls=2 * FALLS))
+
+    def on_finer_intervals(self) -> Iterator[Guess]:
+        """The longest of them on twice as many intervals, unless their number is given.
+
+        Case: scene 486 of the stress study, seed 1128.
+        """
+        if self.search.options.time_intervals is None:
+            name = f"{LONGER}, on twice as many intervals"
+            yield Guess(name, self._guess(falls=2 * FALLS, finer=2))
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
@@ -611,11 +623,13 @@ def guess_stages(
     pieces: Sequence[PathGuess] | None = None,
     profile: PathSpeed | None = None,
     falls: float = FALLS,
+    finer: int = 1,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
-    The guessed duration is `falls` times that of a fall over the length of the initial paths. A
-    single phase may follow the pieces of a given one, with its speed profile.
+    The guessed duration is `falls` times that of a fall over the length of the initial paths, and
+    there are `finer` times as many intervals as usual. A single phase may follow the pieces of a
+    given one, with its speed profile.
     """
     scene, phases, options = search.source.scene, search.phases, search.options
     parts = list[tuple[Phase, PathGuess]]()  # in own units
@@ -644,7 +658,7 @@ def guess_stages(
             row, value = phase.until.lead(start, 1.0).poses[0]
             ahead = row, value, 1.0 if value > start[row] else -1.0
         whole = lengths[[owner is phase for owner, _ in parts]].sum()
-        intervals = options.time_intervals or 10  # of a phase to start with
+        intervals = finer * (options.time_intervals or 10)  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         along = clock[k : k + 2], ends[k : k + 2], total, profile
         guess = _guess(outline, search.scheme, count, *along)

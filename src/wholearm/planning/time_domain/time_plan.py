@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmError, name_phases
+from ...common.errors import (
+    InfeasibleError,
+    Parameter,
+    Shortfall,
+    SolverError,
+    WholearmError,
+    name_phases,
+)
 from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
@@ -117,7 +124,8 @@ def plan_phases(
     if solution is None:
         listed = iter([guesses.nearest])
         if thorough:
-            listed = chain(guesses.every(), _free_ends(search, guesses))
+            others = guesses.on_finer_intervals()
+            listed = chain(guesses.every(), _free_ends(search, guesses), others)
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
         solution = solve_guesses(
@@ -279,10 +287,11 @@ def solve_guesses(
     If the first ones fail, `refuse` may raise an error that says why. `most` is as of
     `solve_coarse`.
     """
-    coarse, lost = list[TimeSolution](), list[TimeSolution]()
+    coarse, lost, compared = list[TimeSolution](), list[TimeSolution](), False
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
+        compared |= guess.homotopy
         solution = solve_coarse(search, guess, most)
         if solution.success and any(is_same(solution, other) for other in lost):
             continue
@@ -290,7 +299,7 @@ def solve_guesses(
             coarse.append(solution)
         elif refuse and not coarse and guess.name == NEAREST:
             refuse()
-        if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
+        if coarse and (compared or not may_gain(search, solution)):
             if best := _refine_best(search, coarse):
                 return best
             lost, coarse = lost + coarse, []
@@ -601,11 +610,12 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     """Plan from motions of least violation, or the error that says why there is none."""
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
-    short = list[list[Stage]]()
+    short, missed = list[list[Stage]](), list[Shortfall]()
     soft = search.aiming(Objective.ELASTIC)
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
         elastic = soft.solve(guess.stages)
-        if elastic.success and not list_shortfalls(search, elastic.stages):
+        missed = list_shortfalls(search, elastic.stages)
+        if elastic.success and not missed:
             # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
             solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if solution is not None:
@@ -614,7 +624,7 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
             short.append(elastic.stages)
     if not short:
         refuse_paths(search, [margin for margin, _ in guesses.paths])
-    raise explain_stages(search, short, replan)
+    raise explain_stages(search, short, replan, missed)
 
 
 def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[TimeMotion]]:
