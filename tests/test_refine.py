@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from wholearm import SolverError
-from wholearm.planning.refinement import SOLVES, CostlyError, refine
+from wholearm.planning.refinement import SOLVES, refine
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,6 @@ class Halving:
     unsolved: int = 0  # meshes without a solution
     gone: int = 99  # solves after which there is none any more
     least: int = 99  # solves after which nothing is left to adapt
-    costly: int = 99  # solves after which all cost too much
     mesh: int = 0
     solves: int = 0
 
@@ -30,8 +29,6 @@ class Halving:
     def solve(self) -> Halving:
         if self.mesh < self.unsolved or self.solves >= self.gone:
             raise SolverError(f"no solution on mesh {self.mesh}")
-        if self.solves >= self.costly:
-            raise CostlyError("too much")
         return replace(self, solves=self.solves + 1)
 
     def adapt(self) -> Halving | None:
@@ -54,9 +51,7 @@ def test_refinement_ends_below_the_accuracy_without_violations() -> None:
 
 
 def test_what_was_found_is_kept_where_the_next_one_has_no_solution() -> None:
-    assert refined(0.0, gone=6).solves == refined(0.0, costly=6).solves == 6
-    with pytest.raises(CostlyError):
-        refined(0.0, costly=2)
+    assert refined(0.0, gone=6).solves == 6
 
 
 def test_finer_meshes_are_tried_until_there_is_a_solution() -> None:

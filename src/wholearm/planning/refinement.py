@@ -56,12 +56,12 @@ def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
             break
         try:
             iterate = iterate.solve()
+        except CostlyError:
+            raise
         except SolverError as error:
             failure = failure or error
             if best is not None:
                 return best
-            if isinstance(error, CostlyError):
-                raise
             iterate = iterate.restart()
             continue
         violation = iterate.violation
