@@ -113,9 +113,8 @@ def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array
     `levels`, (n, m, 5), are limits over their margins, linear in (1, a, b, s', internal force).
     """
     base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
-    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
-    best = [choose_internal_force(one, [0.0] * len(one), by, 0.0) for one, by in pairs]
-    level, internal = np.array(best).T
+    lines = np.stack([base, levels[..., LAMBDA]], axis=2).tolist()
+    level, internal = np.array([choose_internal_force(each) for each in lines]).T
     return level, internal
 
 
