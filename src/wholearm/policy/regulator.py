@@ -167,7 +167,11 @@ def follow(
 
 
 def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
-    """Stretches with constant contact modes at instants of a phase of a plan."""
+    """Stretches with constant contact modes at instants of a phase of a plan.
+
+    Accelerations and forces are those of the torques: between the samples of a loaded plan they
+    step where modes change.
+    """
     spans, names = list_modes(phase, plan), phase.formation.names
     begins = [span["start"] for span in spans[1:]]
     owner = np.searchsorted(begins, t - plan.phase_starts[phase.index], side="right")
@@ -175,30 +179,21 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         modes = [spans[k]["contacts"][name] for name in names]
         pairs = zip(phase.formation.contacts, modes, strict=True)
         rolling = tuple(contact for contact, mode in pairs if mode == "rolls")
-        signs = [SIGNS[mode] for mode in (*modes, *spans[k]["joints"])]
-        formation = replace(phase.formation, rolling=rolling)
-        yield _stretch(formation, np.array(signs), plan, t[owner == k])
-
-
-def _stretch(formation: Formation, signs: Array, plan: Trajectory, t: Array) -> RegulatedStretch:
-    """A part of a plan at n instants, by the directions of contacts and joints, (n_c + 2,).
-
-    Accelerations and forces are those of the torques: between the samples of a loaded plan they
-    step where modes change.
-    """
-    samples = plan.at(t)
-    z, v = samples.z, samples.z_dot
-    directions = Directions(*np.split(np.tile(signs, (len(t), 1)), [formation.n_contacts], axis=1))
-    forward = Batch(build_forward(formation))
-    acceleration, _, _ = forward(z, v, plan.torque.at(t), *directions)
-    kinematics = formation.evaluate(z, v)
-    forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
-    limits = make_limits(formation, 0.0).without(SPEED)
-    weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
-    torque = np.isin(limits.sides[0], limits.of(TORQUE))
-    margins = np.where(torque, ROOM, PRESS * weights)
-    levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
-    return RegulatedStretch(formation, z, v, directions, forces, levels)
+        formation, times = replace(phase.formation, rolling=rolling), t[owner == k]
+        signs = np.tile([SIGNS[mode] for mode in (*modes, *spans[k]["joints"])], (len(times), 1))
+        directions = Directions(*np.split(signs, [formation.n_contacts], axis=1))
+        samples = plan.at(times)
+        z, v = samples.z, samples.z_dot
+        forward = Batch(build_forward(formation))
+        acceleration, _, _ = forward(z, v, plan.torque.at(times), *directions)
+        kinematics = formation.evaluate(z, v)
+        forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
+        limits = make_limits(formation, 0.0).without(SPEED)
+        weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
+        torque = np.isin(limits.sides[0], limits.of(TORQUE))
+        margins = np.where(torque, ROOM, PRESS * weights)
+        levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
+        yield RegulatedStretch(formation, z, v, directions, forces, levels)
 
 
 def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
@@ -269,8 +264,7 @@ def regulate(linearizations: list[Linear], step: float) -> Array:
     from scipy.linalg import cholesky, solve_continuous_are
 
     gains, P, after = np.zeros((len(linearizations), 2, 4)), np.zeros((0, 0)), list[int]()
-    for k in range(len(linearizations) - 1, -1, -1):
-        linear = linearizations[k]
+    for k, linear in reversed(list(enumerate(linearizations))):
         N, f = linear.N, linear.N.shape[1]
         Q = np.kron(np.diag([RATE**4, 2 * RATE**2]), linear.metric)
         inputs = np.vstack([np.zeros((f, 2)), linear.B])
@@ -309,7 +303,11 @@ def tabulate_motion(
     b, tau, gains, slow = follow(problem, phases, plan, t)
     speed = np.sqrt(b)
     still = STILL * problem.scene.scales.rate
-    ways = _list_free_joints(problem, last, samples.z[-1:])
+    # Orthonormal basis of the joint displacements that the contacts at the end leave free.
+    both = last.formation.add(last.until.contact)
+    left = _span(both, both.evaluate(samples.z[-1:], np.zeros((1, 5))).P)[0].T
+    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
+    ways = basis.T[sizes > 1e-3 / np.sqrt(metric_weights(problem.scene))[3]]
     # Towards the contact, across what it leaves free.
     heading = samples.z[-1, 3:] - samples.z[-2, 3:]
     heading = heading - ways.T @ (ways @ heading)
@@ -326,15 +324,6 @@ def tabulate_motion(
         "still": np.array([still]),
         "ways": ways,
     }
-
-
-def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
-    """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
-    both = phase.formation.add(phase.until.contact)
-    left = _span(both, both.evaluate(z, np.zeros_like(z)).P)[0].T
-    units = np.sqrt(metric_weights(problem.scene))
-    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
-    return np.asarray(basis.T[sizes > 1e-3 / units[3]])
 
 
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
