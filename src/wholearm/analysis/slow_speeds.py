@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table, fixed
@@ -132,6 +131,14 @@ def _predict_phase(
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
     held = (grasp.least >= problem.epsilon) & (path.inertia > 0)
+    # Least forces are drawn about the speeds at which something breaks.
+    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
+    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
+    speeds = np.geomspace(*ends, 61)
+    forces = {
+        name: np.array([evaluate(speed).force for speed in speeds.tolist()])
+        for name, (evaluate, _) in motions.items()
+    }
     return PhasePrediction(
         number=phase.number,
         contacts=names,
@@ -142,7 +149,7 @@ def _predict_phase(
         kept=tuple((_place(path, r.start), _place(path, r.stop - 1)) for r in find_runs(held)),
         survivals=tuple(survivals),
         torques=torques,
-        curves=_draw(survivals, motions, unit),
+        curves=Curves(speeds, forces),
     )
 
 
@@ -183,20 +190,6 @@ def _name(path: PathSamples, least: Least) -> Weakest:
 
 def _place(path: PathSamples, row: int) -> Place:
     return Place(float(path.s[row]), float(path.z[row, 0]), float(path.z[row, 2]))
-
-
-def _draw(
-    survivals: Sequence[Survival], motions: dict[str, tuple[Evaluate, float]], unit: float
-) -> Curves:
-    """Least forces over speed, about those at which something breaks."""
-    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
-    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
-    speeds = np.geomspace(*ends, 61)
-    forces = {
-        name: np.array([evaluate(speed).force for speed in speeds.tolist()])
-        for name, (evaluate, _) in motions.items()
-    }
-    return Curves(speeds, forces)
 
 
 class Least(NamedTuple):
@@ -353,7 +346,13 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
             curve = replace(curve, length=RELEASE_AT * curve.length)
-        s, owners = _sample_segments(curve)
+        # Both ends of each segment, and denser there, where motions start and stop.
+        sizes = [part.stop - part.start for part in curve.segments]
+        counts = [max(5, round(PLACES * size / curve.length)) for size in sizes]
+        shares = [(1 - np.cos(np.linspace(0.0, np.pi, count))) / 2 for count in counts]
+        owners = np.repeat(np.arange(len(counts)), counts)
+        starts = np.array([part.start for part in curve.segments])
+        s = starts[owners] + np.concatenate(shares) * np.array(sizes)[owners]
         point = curve.evaluate(s)
         (places, z_s, z_ss), kinematics = point[:3], point.kinematics
         directions = directions_of(curve, owners)
@@ -368,18 +367,6 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
     inertia = reduced_inertia(formation, kinematics, directions)
     line = s, places, z_s, z_ss
     return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
-
-
-def _sample_segments(curve: Curve) -> tuple[Array, NDArray[np.int64]]:
-    """Places along a curve, both ends of each segment, and the segment of each."""
-    places, owners = [], []
-    for index, part in enumerate(curve.segments):
-        count = max(5, round(PLACES * (part.stop - part.start) / curve.length))
-        # Denser at the ends, where motions start and stop.
-        turn = (1 - np.cos(np.linspace(0.0, np.pi, count))) / 2
-        places.append(part.start + turn * (part.stop - part.start))
-        owners.append(np.full(count, index))
-    return np.concatenate(places), np.concatenate(owners)
 
 
 def _straighten(

@@ -35,7 +35,6 @@ from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
 from ..scene.model import TURN, Polygon, Scene, check_place
 from .borders import (
-    Piece,
     Track,
     Window,
     cut,
@@ -345,7 +344,14 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
         for piece in cut(scene, [leg.track])
         if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
     ]
-    _require_reached(scene, leg, kept, [low + near, high - near])
+    reached = [float(s) for piece in kept for s in piece.places[[0, -1]]]
+    ends = [low + near, *reached, high - near]
+    for before, after in zip(ends[::2], ends[1::2], strict=True):
+        if after - before > 1e-6 * leg.near:
+            pose = leg.at((before + after) / 2)
+            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
+            text = text or "there the border has ended"
+            raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
     spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
     # The ends of shorter parts are one crossing.
     spans = [span for span in spans if span[2] - span[1] > 1e-3 * leg.near] or spans
@@ -416,16 +422,6 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
     return kept
 
 
-def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
-    ends = [ends[0], *(float(s) for piece in kept for s in piece.places[[0, -1]]), ends[1]]
-    for before, after in zip(ends[::2], ends[1::2], strict=True):
-        if after - before > 1e-6 * leg.near:
-            pose = leg.at((before + after) / 2)
-            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
-            text = text or "there the border has ended"
-            raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
-
-
 @dataclass(frozen=True, eq=False)
 class Leg:
     """A curve in the (x, phi) plane."""
@@ -449,8 +445,8 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
     """The border that both ends are near, or a straight line."""
     candidates = []
     for leg, off in _list_near(scene, start, stop):
-        flush = leg.track.flush
-        if off < 1 and (flush is None or flush[0] is None):
+        assert leg.track.flush is not None
+        if off < 1 and leg.track.flush[0] is None:
             return leg
         if off < 1:
             # Both ends have to be near the same piece of the curve, or near one each.

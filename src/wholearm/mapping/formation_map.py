@@ -51,9 +51,8 @@ from .borders import (
 )
 from .formation_list import trace_problem
 
-WAYS = ("+x", "-x", "+phi", "-phi")  # directions of travel inside a cell
+WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # travel inside a cell: x, phi
 REGULAR = 1e-9  # least ratio of singular values of independent contacts; least determinant likewise
-_WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 Flush = tuple[int | None, int]  # a finger (None for the palm) and an edge that lies flush on it
 CROSSED = -5  # cell of the places where the closed fingers would overlap
 NODES = 24  # intervals of a border
@@ -266,7 +265,7 @@ def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> t
     matrix = np.concatenate([kinematics.A, pose], axis=1)
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     tangents = np.zeros((len(z), len(WAYS), 5))
-    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ _WAYS.T).swapaxes(1, 2)
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
     return _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
 
 
