@@ -199,9 +199,8 @@ class Part(NamedTuple):
     contacts: tuple[Contact, ...]
     start: Array  # start, stop (2,) [m, rad]: x and phi at its ends
     stop: Array
-    gained: tuple[Contact, ...]  # at its end; empty where it ends inside a cell
+    gained: tuple[Contact, ...]  # at its end; empty where it ends inside a cell, or at an obstacle
     coordinate: int  # {0, 1}: x or phi, whichever changes more
-    inside: Array  # (2,) [m, rad]: end without a gained contact: `stop`, or before an obstacle
 
 
 Walked = tuple[Step, Array]  # a phase, and the configuration at its end
@@ -259,9 +258,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
             continue
         if len(part.contacts) == 4:
             # A contact may be gained in both directions along a border.
-            pose = end[[0, 2]]
-            away = np.minimum(np.abs(pose - part.stop), np.abs(pose - part.inside))
-            if not (away < tolerance(scene)).all():
+            if not (np.abs(end[[0, 2]] - part.stop) < tolerance(scene)).all():
                 text = f"{steps[-1][1]} is first reached at {describe_pose(end)}"
                 first = first or InputError("", "", text)
                 continue
@@ -280,10 +277,8 @@ def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
 
 def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
     """Candidate phases for a part from `z`, the simplest first."""
-    simple: list[list[Step]] = [[(part.contacts, Until(contact=c))] for c in part.gained]
-    ends: list[list[Step]] = list(simple) or [[]]
-    if not part.gained or (part.inside != part.stop).any():
-        simple.append([(part.contacts, end_at(scene, part.coordinate, part.inside))])
+    gains = [[(part.contacts, Until(contact=c))] for c in part.gained]
+    simple = gains or [[(part.contacts, end_at(scene, part.coordinate, part.stop))]]
     if last and len(part.contacts) == 3:
         # One phase with terminal constraints on the pose.
         pose = [end_at(scene, row, part.stop) for row in (0, 1)]
@@ -307,7 +302,7 @@ def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list
     between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(between, count):
-            yield from ([*chosen, *end] for end in ends)
+            yield from ([*chosen, *end] for end in gains or [[]])
 
 
 def end_at(scene: Scene, row: int, pose: Array) -> Until:
@@ -377,7 +372,6 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
         mine = name_contacts(table, label)
         begin, end = leg.at(first), leg.at(last)
         gained: tuple[Contact, ...] = ()
-        inside = end
         if index + 1 < len(spans):
             following = name_contacts(table, spans[index + 1][0])
             gained = tuple(c for c in following if c not in mine)
@@ -389,11 +383,12 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             z = close_fingers(scene, end[:1], end[1:]).z[0]
             touching = find_touching(scene, z) if np.isfinite(z).all() else ()
             gained = tuple(c for c in touching if c not in mine)
-            inside = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
+            if not gained:
+                end = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
         coordinate = int((np.abs(end - begin) / near).argmax())
         if leg.track.flush is not None:
             coordinate = 0 if leg.track.flush[0] is None else 1
-        parts.append(Part(mine, begin, end, gained, coordinate, inside))
+        parts.append(Part(mine, begin, end, gained, coordinate))
     return parts
 
 

@@ -293,7 +293,21 @@ class Roadmap:
 def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
     """The fastest straight path through each cell to each contact, from places of one scene."""
     scene = places[0].scene
-    rays = shoot(places, epsilon)
+    cells, held = _list_cells(places)
+    angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
+    headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
+    sources = np.repeat(np.arange(len(places)), HEADINGS)
+    starts = np.array([place.z[[0, 2]] for place in places])[sources]
+    runs = np.tile(headings, (len(places), 1))
+    labels = label_cells(scene, *(starts + FIRST * runs).T)[:, [0, 2, 4]]
+    kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
+    rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
+    if len(rays.sources):
+        limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
+        rays = rays.pick(limits.can_rest())
+    s, after = _find_exits(scene, rays)
+    rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
+    rays = _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
     times = time_paths(scene, epsilon, rays.labels, rays.starts, rays.ends)
     best: dict[tuple[int, ...], int] = {}
     for k in np.flatnonzero(np.isfinite(times)).tolist():
@@ -329,26 +343,6 @@ class Rays(NamedTuple):
     def runs(self) -> Array:
         """From starts to ends, shape (n, 2)."""
         return self.ends - self.starts
-
-
-def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
-    """Rays from places of one scene, along which a motion can start, to the contact they gain."""
-    scene = places[0].scene
-    cells, held = _list_cells(places)
-    angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
-    headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
-    sources = np.repeat(np.arange(len(places)), HEADINGS)
-    starts = np.array([place.z[[0, 2]] for place in places])[sources]
-    runs = np.tile(headings, (len(places), 1))
-    labels = label_cells(scene, *(starts + FIRST * runs).T)[:, [0, 2, 4]]
-    kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
-    rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
-    if len(rays.sources):
-        limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
-        rays = rays.pick(limits.can_rest())
-    s, after = _find_exits(scene, rays)
-    rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
-    return _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
 
 
 def _find_exits(scene: Scene, rays: Rays) -> tuple[Array, Numbers]:
