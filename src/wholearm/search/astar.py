@@ -18,6 +18,8 @@ from itertools import count, pairwise, takewhile
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, cast
 
+import numpy as np
+
 from ..common.parallel import Task, share
 from ..common.signals import Reporter, beat
 from ..contacts.elemental import Contact
@@ -25,7 +27,7 @@ from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
-from ..problem.definition import Goal, Phase, Problem
+from ..problem.definition import End, Goal, Phase, Problem, Until
 from .edge_plans import (
     CoarsePlan,
     Lost,
@@ -39,7 +41,7 @@ from .edge_plans import (
     split_route,
     time_with,
 )
-from .edges import ROUGHLY, Blocked, Edge, describe_steps, leave_at
+from .edges import ROUGHLY, Blocked, Edge, EdgeStep, describe_steps, point_out
 from .places import Key, RoadmapPlace, is_at
 from .roadmap import Roadmap
 
@@ -489,17 +491,23 @@ class RoutePlanner:
 
         That plan stops where it leaves the border.
         """
-        place = None if path.move is None else edge.share + FINEST * path.move
-        if place is not None and not INSIDE < place < 1 - INSIDE:
-            return None
+        first, *rest = edge.steps
+        step = EdgeStep(first.contacts, Until(), End.SMOOTH)
+        if path.move is not None:
+            place = edge.share + FINEST * path.move
+            if not INSIDE < place < 1 - INSIDE:
+                return None
+            assert edge.left is not None
+            z = edge.left.evaluate(np.array([place * edge.left.length])).z[0]
+            step = first._replace(until=point_out(first.contacts, z))
         # In motion the first guess has no plan in goal 48 of the corpus.
         return plan_coarsely(
             self.problem,
             edge,
-            leave_at(edge, place),
+            (step, *rest),
             self.options,
             straight=path.straight,
-            first_only=place is not None,
+            first_only=path.move is not None,
             stopped=stopped,
         )
 

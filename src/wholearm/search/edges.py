@@ -292,16 +292,6 @@ def point_out(contacts: Sequence[Contact], z: Array) -> Until:
     return Until(coordinate="phi", value=float(z[2]))
 
 
-def leave_at(edge: Edge, share: float | None) -> tuple[EdgeStep, ...]:
-    """The phases of an edge that leaves a border at a share of its length; with None in motion."""
-    first, *rest = edge.steps
-    if share is None:
-        return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
-    assert edge.left is not None
-    z = edge.left.evaluate(np.array([share * edge.left.length])).z[0]
-    return (first._replace(until=point_out(first.contacts, z)), *rest)
-
-
 def describe_steps(steps: Sequence[EdgeStep]) -> str:
     """Phases of an edge in words."""
     return ", then ".join(
