@@ -746,8 +746,7 @@ def make_policy(
                 entry["duration"] += settings.dwell + delay
         about += entries
     duration = sum(phase["duration"] for phase in about)
-    whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
-    whole["problem"] = given
+    whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:
         whole.update(ranges=dict(ranges), reserve=reserve)
     return Policy(tables, settings, whole)
