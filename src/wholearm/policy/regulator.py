@@ -411,41 +411,35 @@ def _replan_blocks(
 
     Those with several freedoms last at most `longest` times as long.
     """
-    starts, phases = plan.phase_starts, list[PlannedPhase]()
+    starts, phases, scene = plan.phase_starts, list[PlannedPhase](), problem.scene
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
     for block in blocks:
         curve = runs_on_curves(block)
-        part = _solve(planner, problem, block, z, 0.0 if curve else share)
+        margin = 0.0 if curve else share
+        ease = 1 - margin * ROOM
+        one, two = (replace(f, torque_limit=ease * f.torque_limit) for f in scene.fingers)
+        tightened = replace(
+            problem,
+            start=z,
+            epsilon=max(problem.epsilon, margin * PRESS * scene.scales.force),
+            scene=replace(scene, fingers=(one, two)),
+            phases=tuple(replace(phase, index=k) for k, phase in enumerate(block)),
+        )
+        try:
+            part = planner(tightened)
+        except WholearmError:
+            return []
         lasts = starts[block[-1].index + 1] - starts[block[0].index]
-        if part is None or (not curve and part.duration > longest * lasts):
+        if not curve and part.duration > longest * lasts:
             return []
         phases += list_phases(part)
         z = part.z[-1]
         away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
-        away[:2] /= problem.scene.scales.length
+        away[:2] /= scene.scales.length
         if away.max() < SAME:
             return phases
     return []
-
-
-def _solve(
-    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
-) -> Trajectory | None:
-    """Plan of phases from a configuration at rest, with a share of the margin."""
-    scene, ease = problem.scene, 1 - share * ROOM
-    one, two = (replace(f, torque_limit=ease * f.torque_limit) for f in scene.fingers)
-    tightened = replace(
-        problem,
-        start=z,
-        epsilon=max(problem.epsilon, share * PRESS * scene.scales.force),
-        scene=replace(scene, fingers=(one, two)),
-        phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
-    )
-    try:
-        return planner(tightened)
-    except WholearmError:
-        return None
 
 
 def _pin(phase: Phase, z: Array) -> Phase:
