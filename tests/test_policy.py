@@ -26,15 +26,8 @@ from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.mechanics.limits import force_limit_rows
-from wholearm.policy import make, regulator
-from wholearm.policy.curve_law import (
-    CurveLaw,
-    LoopSettings,
-    MotionLaw,
-    _choose_at,
-    _evaluate,
-    choose_internal_force,
-)
+from wholearm.policy import curve_law, make, regulator
+from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
 from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
@@ -281,8 +274,9 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         z, chord = plan.z[row], np.array(law.chords[k]) / law.steps[k]
         v = plan.z_dot[row] * speed * np.linalg.norm(chord) / np.linalg.norm(plan.z_dot[row, 3:])
         a = (law.b[k] - law.b[k - 1]) / (2 * law.steps[k - 1])
-        levels, torques = (_evaluate(t[k - 1], 1.0, speed) for t in (law.levels, law.torque))
-        tau = np.array(torques) @ [1.0, a, _choose_at(levels, a)[1]]
+        tables = law.levels[k - 1], law.torque[k - 1]
+        levels, torques = (curve_law._evaluate(table, 1.0, speed) for table in tables)
+        tau = np.array(torques) @ [1.0, a, curve_law._choose_at(levels, a)[1]]
         signs = np.sign(phase.formation.evaluate(z[None], v[None]).A_t[0] @ v), np.sign(v[3:])
         c = build_forward(phase.formation)(z, v, tau, *signs)[1].full()
         assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone
