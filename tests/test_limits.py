@@ -214,7 +214,7 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     path = labels, pose + np.array([-0.008, 0.1]), pose + np.array([0.015, 0.23])
 
     def measure(epsilon: float) -> Array:
-        border = BorderEdge(place, curve, None, Terms(EPSILON, 0.0))
+        border = BorderEdge(place, curve, Terms(EPSILON, 0.0))
         least = bound_least_time([curve], EPSILON)
         assert least is not None
         of_border = estimate_duration([border.limits]), time_parts(border, np.array([1.0]))[0]

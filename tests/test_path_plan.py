@@ -544,7 +544,7 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     # Nor does the search for routes give up the border on which it lies.
     slow = curves[1]
     place = make_place(slow.formation.scene, slow.start)
-    border = BorderEdge(place, slow, None, Terms(epsilon, 0.1))
+    border = BorderEdge(place, slow, Terms(epsilon, 0.1))
     edge = edge_along((border,), (1.0,), (), border.stop)
     # A crawl through that place on the first grid is a tenth too slow; 1 would be no estimate.
     assert isinstance(edge, Edge) and edge.estimate == pytest.approx(

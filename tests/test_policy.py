@@ -26,7 +26,7 @@ from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.mechanics.limits import force_limit_rows
-from wholearm.policy import make, regulator
+from wholearm.policy import curve_law, make, regulator
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
 from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
 from wholearm.problem.definition import End
@@ -66,9 +66,8 @@ def test_pressing_against_a_new_contact_lifts_no_light_object() -> None:
 def test_the_squeeze_has_the_largest_least_level() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
-        base, rates, press = rng.normal(size=(3, 8))
-        level, squeeze = choose_internal_force(base.tolist(), rates.tolist(), press.tolist(), 0.3)
-        values = base + 0.3 * rates
+        values, press = rng.normal(size=(2, 8))
+        level, squeeze = choose_internal_force(np.column_stack([values, press]).tolist())
         assert level == pytest.approx((values + press * squeeze).min(), abs=1e-12)
         rows = np.column_stack([np.ones(8), -press])
         best = linprog([-1, 0], A_ub=rows, b_ub=values, bounds=[(None, None)] * 2)
@@ -78,10 +77,9 @@ def test_the_squeeze_has_the_largest_least_level() -> None:
 def test_limits_that_the_squeeze_does_not_change_leave_it_where_it_is(policy: Policy) -> None:
     rng = np.random.default_rng(4)
     for _ in range(20):
-        base, press = rng.normal(size=(2, 8))
-        level, squeeze = choose_internal_force(base.tolist(), [0.0] * 8, press.tolist(), 0.0)
-        limits = [*base.tolist(), level - 1.0], [0.0] * 9, [*press.tolist(), 0.0]
-        assert choose_internal_force(*limits, 0.0) == (level - 1.0, squeeze)
+        lines = rng.normal(size=(8, 2)).tolist()
+        level, squeeze = choose_internal_force(lines)
+        assert choose_internal_force([*lines, (level - 1.0, 0.0)]) == (level - 1.0, squeeze)
     # A coefficient that is 0 but for rounding counts as 0.
     tables, levels = dict(policy.tables[0]), []
     for rounding in (0.0, 5e-15, -2e-17):
@@ -276,8 +274,9 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         z, chord = plan.z[row], np.array(law.chords[k]) / law.steps[k]
         v = plan.z_dot[row] * speed * np.linalg.norm(chord) / np.linalg.norm(plan.z_dot[row, 3:])
         a = (law.b[k] - law.b[k - 1]) / (2 * law.steps[k - 1])
-        internal = choose_internal_force(*law._list_levels(k - 1, 1.0, speed), a)[1]
-        tau = np.array(law._list_torques(k - 1, 1.0, speed)) @ [1.0, a, internal]
+        tables = law.levels[k - 1], law.torque[k - 1]
+        levels, torques = (curve_law._evaluate(table, 1.0, speed) for table in tables)
+        tau = np.array(torques) @ [1.0, a, curve_law._choose_at(levels, a)[1]]
         signs = np.sign(phase.formation.evaluate(z[None], v[None]).A_t[0] @ v), np.sign(v[3:])
         c = build_forward(phase.formation)(z, v, tau, *signs)[1].full()
         assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone

@@ -124,10 +124,10 @@ def test_quasistatic_torques_balance_and_are_the_least() -> None:
 def replay(speed: float) -> Simulation:
     """The first phase from rest to rest with the best squeeze."""
     road = road_of(HEPTAGON)
-    pace = slow_speeds.UnitProfile.between(road, (True, True))
-    a, b = speed**2 * pace.a, speed**2 * pace.b
+    x = road.s / road.length
+    a, b = speed**2 * 2 * (1 - 2 * x) / road.length, speed**2 * 4 * x * (1 - x)
     tau = road.forces.tau(a, b, road.force_limits.find_best(a, b).internal_force)
-    t = pace.way / speed * np.arccos(1 - 2 * road.s / road.length) / np.pi
+    t = road.length / (2 * speed) * np.arccos(1 - 2 * x)
     return simulate(first_phase(), TorqueProfile.join_rows(t, tau))
 
 

@@ -296,7 +296,7 @@ def test_edges_that_cannot_be_planned_are_named() -> None:
 def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     """Paths through cells take longer away from a best place, and there is none beyond an end."""
 
-    def plan(path: RefinedPath) -> edge_plans.CoarsePlan | None:
+    def plan(path: RefinedPath, _: object) -> edge_plans.CoarsePlan | None:
         if path.move is None or path.move < end:
             return None
         return edge_plans.CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
@@ -304,13 +304,14 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     found, *others = search_release(plan, edge_plans.CoarsePlan(1 + FINEST * abs(best), (), []))
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
-    assert search_release(plan, found, go_on=lambda one: one._replace(duration=0.9))[0].duration < 1
+    plan_on = lambda path, one: one._replace(duration=0.9) if one else plan(path, one)  # noqa: E731
+    assert search_release(plan_on, found)[0].duration < 1
 
 
 def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
     """An edge that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
 
-    def plan(path: RefinedPath) -> edge_plans.CoarsePlan | None:
+    def plan(path: RefinedPath, _: object = None) -> edge_plans.CoarsePlan | None:
         if path.move is None:
             return None
         z = np.full((1, 5), float(path.move))

@@ -6,9 +6,8 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 
@@ -156,14 +155,13 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
             require_made_for(problem, meta)
         simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
         simulations = simulations if isinstance(simulations, int) else None
-    peaks = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
-    common: dict[str, Any] = {"name": name, "problem": problem, "planned": planned}
-    common |= {"effort": torque.integrate_squares(), "peaks": tuple(peaks.tolist())}
-    common |= {"simulations": simulations}
+    one, two = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2)).tolist()
+    numbers = torque.duration, torque.integrate_squares(), (one, two), simulations
+    contender = Contender(name, False, "", *numbers, problem=problem, planned=planned)
     try:
         report = verify(problem, planned or torque)
     except (JammingError, SimulationError) as error:
-        return Contender(ok=False, reason=str(error), duration=torque.duration, **common)
+        return replace(contender, reason=str(error))
     forces = [(find_least_force(phase), phase.number) for phase in report.phases]
     least, number = min(
         ((force, number) for force, number in forces if force is not None),
@@ -171,7 +169,8 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         default=(None, 0),
     )
     energy, end = report.energy, report.phases[-1].arrival
-    return Contender(
+    return replace(
+        contender,
         ok=report.ok,
         reason=report.reason,
         duration=end if report.reached and end is not None else torque.duration,
@@ -185,5 +184,4 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         ),
         margins=tuple(math.nan if force is None else force.margin for force, _ in forces),
         report=report,
-        **common,
     )

@@ -222,27 +222,9 @@ class Trial:
         return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
     def judge(
-        self, simulation: FreeSimulation, start: float, stops: Sequence[float]
-    ) -> dict[str, Any]:
-        """Compare a motion, and when its phases start and stop [s], with the plan; as `run`."""
-        off = simulation.z[-1, :3] - self.goal
-        distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
-        given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
-        lost, phase, time, least = self._follow(simulation, start, stops)
-        even = np.linspace(0.0, simulation.t[-1], 24)
-        path = np.column_stack([np.interp(even, simulation.t, column) for column in simulation.z.T])
-        near = distance <= self.uncertainty.find_distance(self.problem.scene)
-        near = near and angle <= self.uncertainty.angle
-        ended = simulation.outcome.text if given_up else ""
-        verdict = {"reached": near and not given_up, "kept": not lost and not given_up}
-        loss = {"lost": lost, "phase": phase, "time": time, "least": least}
-        ends = {"distance": distance, "angle": angle}
-        return ends | verdict | loss | {"path": path.tolist(), "ended": ended}
-
-    def _follow(
         self, simulation: FreeSimulation, began: float, stops: Sequence[float]
-    ) -> tuple[str, int | None, float | None, float]:
-        """The first planned contact that is lost, its phase and when, and the least c_n.
+    ) -> dict[str, Any]:
+        """Compare a motion, and when its phases start and stop [s], with the plan; as `run`.
 
         A phase goes on from when the last one's contact was gained to when its own is, or to its
         end by the clock. A contact is lost that opens for longer than 1e-3 units of time. One that
@@ -268,10 +250,26 @@ class Trial:
                 if window is not self.windows[-1]:
                     losses.append((planned, window.phase, min(window.gained, default="")))
                 break
-        if not losses:
-            return "", None, None, least
-        first, phase, name = min(losses)
-        return name, phase, first, least
+        time, phase, lost = min(losses, default=(None, None, ""))
+        off = simulation.z[-1, :3] - self.goal
+        distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
+        near = distance <= self.uncertainty.find_distance(self.problem.scene)
+        near = near and angle <= self.uncertainty.angle
+        given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
+        even = np.linspace(0.0, t[-1], 24)
+        path = np.column_stack([np.interp(even, t, column) for column in simulation.z.T])
+        return {
+            "distance": distance,
+            "angle": angle,
+            "reached": near and not given_up,
+            "kept": not lost and not given_up,
+            "lost": lost,
+            "phase": phase,
+            "time": time,
+            "least": least,
+            "path": path.tolist(),
+            "ended": simulation.outcome.text if given_up else "",
+        }
 
 
 def make_trial(
@@ -554,7 +552,15 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
         width = trial.uncertainty.widths[parameter.name]
         step = 1e-3 * width
         ends = (0.0, step) if parameter.name == "delay" else (-step, step)
-        forces = [_find_force(trial, parameter.name, value, contact, time) for value in ends]
+        forces = list[float]()
+        for value in ends:
+            change, late = {parameter.name: value}, value if parameter.name == "delay" else 0.0
+            torque = change_torques(trial.torque, change).cut(0.0, time + late)
+            try:
+                simulation = trial.simulate(change, torque)
+                forces.append(float(simulation.c_n[-1, simulation.contacts.index(contact)]))
+            except (InputError, SimulationError):
+                forces.append(math.nan)
         slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
         sensitivities.append(Sensitivity(parameter.name, parameter.unit, width, slope))
     sensitivities.sort(key=lambda one: np.nan_to_num(-abs(one.over_range), nan=math.inf))
@@ -580,17 +586,6 @@ def find_least(
                     least = (name, float(t[row]), float(c_n[row]))
         start = window.stop
     return least
-
-
-def _find_force(trial: Trial, name: str, change: float, contact: str, time: float) -> float:
-    """A contact's c_n at an instant, by the clock of the torques; NaN where it is lost."""
-    late = change if name == "delay" else 0.0
-    torque = change_torques(trial.torque, {name: change}).cut(0.0, time + late)
-    try:
-        simulation = trial.simulate({name: change}, torque)
-    except (InputError, SimulationError):
-        return math.nan
-    return float(simulation.c_n[-1, simulation.contacts.index(contact)])
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.polynomial import Polynomial
 
 from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table, fixed
@@ -45,6 +45,16 @@ PLACES = 241  # about how many places of a phase are looked at
 SQUEEZE = 0.5
 """Internal force of quasistatic torques: 0 least, 1 with the largest least normal force."""
 OWN = "own torques"  # name of the motion under the torques of the quasistatic one
+PROFILES: dict[str, tuple[tuple[float, ...], float]] = {
+    "steady": ((1.0,), 1.0),
+    "moving": ((1.0,), 1.0),
+    "from rest": ((0.0, 1.0), 2.0),
+    "to rest": ((1.0, -1.0), 2.0),
+    "rest to rest": ((0.0, 4.0, -4.0), math.pi / 2),
+}
+"""Speed profiles along a phase, of largest speed one: b = s'^2 as a polynomial of s over the
+length, and the duration over the length. From rest to rest s is a cosine of time; with one end at
+rest s'' is constant, with none the speed is."""
 
 
 @exclusive
@@ -110,10 +120,9 @@ def _predict_phase(
     if path is None:
         return PhasePrediction(phase.number, names, until, "left out", math.nan)
     motion_name = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
-    profile = UnitProfile.between(path, rests)
     motions = {
-        "steady": (evaluate_best(path, UnitProfile.between(path, (False, False))), path.length),
-        motion_name: (evaluate_best(path, profile), profile.way),
+        name: (evaluate_best(path, name), PROFILES[name][1] * path.length)
+        for name in ("steady", motion_name)
     }
     torques = find_torques(path, problem.epsilon, share)
     if torques is not None:
@@ -132,6 +141,14 @@ def _predict_phase(
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
     held = (grasp.least >= problem.epsilon) & (path.inertia > 0)
+    # Least forces are drawn about the speeds at which something breaks.
+    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
+    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
+    speeds = np.geomspace(*ends, 61)
+    forces = {
+        name: np.array([evaluate(speed).force for speed in speeds.tolist()])
+        for name, (evaluate, _) in motions.items()
+    }
     return PhasePrediction(
         number=phase.number,
         contacts=names,
@@ -142,7 +159,7 @@ def _predict_phase(
         kept=tuple((_place(path, r.start), _place(path, r.stop - 1)) for r in find_runs(held)),
         survivals=tuple(survivals),
         torques=torques,
-        curves=_draw(survivals, motions, unit),
+        curves=Curves(speeds, forces),
     )
 
 
@@ -185,20 +202,6 @@ def _place(path: PathSamples, row: int) -> Place:
     return Place(float(path.s[row]), float(path.z[row, 0]), float(path.z[row, 2]))
 
 
-def _draw(
-    survivals: Sequence[Survival], motions: dict[str, tuple[Evaluate, float]], unit: float
-) -> Curves:
-    """Least forces over speed, about those at which something breaks."""
-    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
-    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
-    speeds = np.geomspace(*ends, 61)
-    forces = {
-        name: np.array([evaluate(speed).force for speed in speeds.tolist()])
-        for name, (evaluate, _) in motions.items()
-    }
-    return Curves(speeds, forces)
-
-
 class Least(NamedTuple):
     """Least normal force along a phase at one speed."""
 
@@ -212,33 +215,16 @@ class Least(NamedTuple):
 Evaluate = Callable[[float], Least]  # what presses least at a speed [m/s]
 
 
-class UnitProfile(NamedTuple):
-    """Speed profile along a phase, of largest speed one: a = s'' and b = s'^2."""
+def evaluate_best(path: PathSamples, profile: str) -> Evaluate:
+    """Least normal force along a path by the largest speed of one of `PROFILES`.
 
-    a: Array  # (n,) [1/m]
-    b: Array  # (n,)
-    way: float  # [m]: duration times the largest speed
-
-    @staticmethod
-    def between(path: PathSamples, rests: tuple[bool, bool]) -> UnitProfile:
-        """From rest or not, to rest or not: a cosine of time from rest to rest.
-
-        With one end at rest s'' is constant, with none the speed is.
-        """
-        x, length = path.s / path.length, path.length
-        if rests == (True, True):
-            return UnitProfile(2 * (1 - 2 * x) / length, 4 * x * (1 - x), np.pi / 2 * length)
-        if not any(rests):
-            return UnitProfile(np.zeros_like(x), np.ones_like(x), length)
-        sign, b = (1.0, x) if rests[0] else (-1.0, 1 - x)
-        return UnitProfile(np.full_like(x, sign / (2 * length)), b, 2 * length)
-
-
-def evaluate_best(path: PathSamples, profile: UnitProfile) -> Evaluate:
-    """Least normal force along a path by speed, with the best internal force at each place."""
+    With the best internal force at each place.
+    """
+    square, x = Polynomial(PROFILES[profile][0]), path.s / path.length
+    a, b = square.deriv()(x) / (2 * path.length), square(x)
 
     def evaluate(speed: float) -> Least:
-        grasp = path.force_limits.find_best(speed**2 * profile.a, speed**2 * profile.b)
+        grasp = path.force_limits.find_best(speed**2 * a, speed**2 * b)
         least = np.where(path.inertia > 0, grasp.least, -np.inf)
         place = int(least.argmin())
         owners = grasp.owners[place].tolist() if path.inertia[place] > 0 else []
@@ -353,7 +339,13 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
             curve = replace(curve, length=RELEASE_AT * curve.length)
-        s, owners = _sample_segments(curve)
+        # Both ends of each segment, and denser there, where motions start and stop.
+        sizes = [part.stop - part.start for part in curve.segments]
+        counts = [max(5, round(PLACES * size / curve.length)) for size in sizes]
+        shares = [(1 - np.cos(np.linspace(0.0, np.pi, count))) / 2 for count in counts]
+        owners = np.repeat(np.arange(len(counts)), counts)
+        starts = np.array([part.start for part in curve.segments])
+        s = starts[owners] + np.concatenate(shares) * np.array(sizes)[owners]
         point = curve.evaluate(s)
         (places, z_s, z_ss), kinematics = point[:3], point.kinematics
         directions = directions_of(curve, owners)
@@ -368,18 +360,6 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
     inertia = reduced_inertia(formation, kinematics, directions)
     line = s, places, z_s, z_ss
     return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
-
-
-def _sample_segments(curve: Curve) -> tuple[Array, NDArray[np.int64]]:
-    """Places along a curve, both ends of each segment, and the segment of each."""
-    places, owners = [], []
-    for index, part in enumerate(curve.segments):
-        count = max(5, round(PLACES * (part.stop - part.start) / curve.length))
-        # Denser at the ends, where motions start and stop.
-        turn = (1 - np.cos(np.linspace(0.0, np.pi, count))) / 2
-        places.append(part.start + turn * (part.stop - part.start))
-        owners.append(np.full(count, index))
-    return np.concatenate(places), np.concatenate(owners)
 
 
 def _straighten(

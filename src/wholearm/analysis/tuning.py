@@ -47,10 +47,6 @@ class TuningSettings:
     slow: float = 3e-5
     coarse: float = 50.0  # factor on that while brakes are compared
     raises: int = 60  # most times a torque is raised or lowered: a factor of 300
-    # By how many steps the supporting torque is raised at once, as each takes a search, and at
-    # most. Case: hexagon, phase 7.
-    support_step: int = 3
-    support: int = 13
     brake_step: int = 2  # by how many steps the acting torque is lowered while it brakes too little
     gain: float = 0.02  # least share of the time by which another 10 % brings the end sooner
     failures: int = 2  # torques that stop nothing after which the search ends, once one has
@@ -420,9 +416,11 @@ class PassageTuner:
         best, (balanced, self.acting) = None, balance
         self.last, count = balanced[-1], len(self.problem.phases)
         self.title = f"phase {tuning.title} of {count}, finger {self.acting + 1}"
-        # Supporting torques until one serves.
-        for tau in list_starts(balanced, self.acting):
-            self.tau = tau
+        # The supporting torque at the start, then the one where it presses most: the right finger
+        # presses anticlockwise, the left one clockwise.
+        supporting, press = balanced[:, 1 - self.acting], np.max if self.acting else np.min
+        for support in dict.fromkeys([supporting[0], press(supporting)]):
+            self.tau = np.where(np.arange(2) == self.acting, balanced[0], support)
             attempt = self._try(replace(tuning, acting=self.acting + 1))
             if attempt.end is not None:
                 return attempt
@@ -563,17 +561,14 @@ class PassageTuner:
 
         The acting torque is lowered to less than the slowest drive's and than balances the object
         at the end. Where no such torque stops any drive there without losing a contact the
-        supporting one becomes that of the end, and then is raised, too.
+        supporting one becomes that of the end.
         """
         count = len(drives)
         chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
         first = min(drives[0].raised - 1, self._count_steps(self.acting))
         last = self._count_steps(1 - self.acting)
         # With two freedoms either torque sets the object in motion again, if it is too much there.
-        likely = [last, 0] if self.is_free else [0, last]
-        for supported in dict.fromkeys(
-            [*likely, *range(SETTINGS.support_step, SETTINGS.support, SETTINGS.support_step)]
-        ):
+        for supported in dict.fromkeys([last, 0] if self.is_free else [0, last]):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
             for drive in chosen:
@@ -787,8 +782,14 @@ class PassageTuner:
         else:
             rests = turn == stop or not simulation.z_dot[at].any()
             outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
-        rate, slowing, z = self._close(simulation, time, at)
-        return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
+        z, v, z_ddot = (part[[at]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
+        if not self.gains and time > 0:
+            sample = simulation.trajectory.at([time])
+            z, v, z_ddot = sample.z, sample.z_dot, sample.z_ddot
+        _, (gradient,), (bend,) = self.end.evaluate(z, v)
+        rate, slowing = -float(gradient @ v[0]), float(gradient @ z_ddot[0] + bend)
+        at_last = contact, rate, slowing, short, least, weakest, z[0]
+        return TuningTrial(steps, outcome, time, *at_last)
 
     def _find_least(
         self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]
@@ -808,24 +809,3 @@ class PassageTuner:
                 row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
                 best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
         return best
-
-    def _close(self, run: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
-        """How fast the end closes, by how much that becomes less, and where."""
-        if self.gains or time == 0:
-            z, v, a = (part[[at]] for part in (run.z, run.z_dot, run.z_ddot))
-        else:
-            sample = run.trajectory.at([time])
-            z, v, a = sample.z, sample.z_dot, sample.z_ddot
-        _, (gradient,), (bend,) = self.end.evaluate(z, v)
-        return -float(gradient @ v[0]), float(gradient @ a[0] + bend), z[0]
-
-
-def list_starts(tau: Array, acting: int) -> list[Array]:
-    """Torques to begin with, of quasistatic ones along the way, shape (n, 2) [N m].
-
-    Those at the start; then with the supporting one where it presses most. The right finger presses
-    anticlockwise, the left one clockwise.
-    """
-    hard = tau[0].copy()
-    hard[1 - acting] = tau[:, 0].max() if acting else tau[:, 1].min()
-    return [tau[0]] if (hard == tau[0]).all() else [tau[0], hard]

@@ -23,7 +23,7 @@ from ..common.errors import InputError
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion, require_same_phases
-from ..results.trajectory import Samples, Trajectory
+from ..results.trajectory import Motion, Samples, Trajectory
 from .interface import (
     Engine,
     EngineRun,
@@ -247,14 +247,6 @@ def replay_in(
     return EngineReport(problem, title, allowed, tuple(stretches), tuple(levels))
 
 
-class _Part(NamedTuple):
-    """A phase of a stretch: its rows of the run, and the plan there."""
-
-    phase: Phase
-    rows: NDArray[np.int64]
-    want: Samples
-
-
 def compare(
     problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun, allowed: float
 ) -> Departure:
@@ -262,16 +254,25 @@ def compare(
 
     `allowed` is the largest error of the position over the scene's length, and of the angle in rad.
     """
-    length = problem.scene.scales.length
-    parts = _divide(problem, plan, stretch, run)
-    error = run.z - np.concatenate([part.want.z for part in parts])
+    length, starts = problem.scene.scales.length, plan.phase_starts
+    # Each phase includes the row at its end.
+    owner = np.searchsorted(starts[1:-1], run.t, side="left")
+    owner = np.clip(owner, stretch.phases[0], stretch.phases[-1])
+    owner[0] = stretch.phases[0]
+    error, forces = np.empty_like(run.z), list[Force]()
+    changes = list[tuple[float, float, str]]()
+    for index in stretch.phases:
+        phase, motion = problem.phases[index], plan.motions[index]
+        rows, t = np.flatnonzero(owner == index), run.t - starts[index]
+        want = motion.evaluate(np.clip(t[rows], 0.0, motion.duration))
+        error[rows] = run.z[rows] - want.z
+        forces += _average(phase, motion, t, rows, run)
+        changes += _list_changes(phase, want, rows, run, allowed * length)
     position, angle = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
-    forces = tuple(force for part in parts for force in _average(plan, part, run))
     beyond = np.flatnonzero(~(np.maximum(position / length, angle) <= allowed))
     if not len(beyond):
-        return Departure(run.t, position, angle, forces, None, "")
+        return Departure(run.t, position, angle, tuple(forces), None, "")
     time = float(run.t[beyond[0]])
-    changes = [c for part in parts for c in _list_changes(problem, part, run, allowed * length)]
     before = [change for change in changes if change[0] <= time]
     # The first one that lasts until then, or else the last one before.
     lasting = [change for change in before if change[1] >= time]
@@ -279,57 +280,43 @@ def compare(
     if before:
         start, _, what = min(lasting) if lasting else max(before, key=lambda change: change[1])
         reason = f"{what} at t = {start:.5g} s"
-    return Departure(run.t, position, angle, forces, time, reason)
+    return Departure(run.t, position, angle, tuple(forces), time, reason)
 
 
-def _divide(
-    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun
-) -> list[_Part]:
-    """The phases of a stretch; each includes the row at its end."""
-    starts, parts = plan.phase_starts, []
-    owner = np.searchsorted(starts[1:-1], run.t, side="left")
-    owner = np.clip(owner, stretch.phases[0], stretch.phases[-1])
-    owner[0] = stretch.phases[0]
-    for index in stretch.phases:
-        rows, motion = np.flatnonzero(owner == index), plan.motions[index]
-        want = motion.evaluate(np.clip(run.t[rows] - starts[index], 0.0, motion.duration))
-        parts.append(_Part(problem.phases[index], rows, want))
-    return parts
-
-
-def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
+def _average(
+    phase: Phase, motion: Motion, t: Array, rows: NDArray[np.int64], run: EngineRun
+) -> list[Force]:
     """Planned and found normal forces of a phase, averaged until the gained contact closes.
 
-    Its gap closes at a vanishing speed: a small error of the pose closes it early.
+    Its gap closes at a vanishing speed: a small error of the pose closes it early. `t` are the
+    times of the run from the start of the phase on, which has some of its `rows`.
     """
-    motion, scene = plan.motions[part.phase.index], part.phase.formation.scene
-    every = part.rows[part.rows > 0]
-    ends = run.cut(every, part.phase.until.contact, scene)
+    scene, every = phase.formation.scene, rows[rows > 0]
+    ends = run.cut(every, phase.until.contact, scene)
     ends = ends if len(ends) else every[:1]
-    time = run.t[ends[-1]] - plan.phase_starts[part.phase.index]
-    middles = (np.arange(2000) + 0.5) / 2000 * min(time, motion.duration)
+    middles = (np.arange(2000) + 0.5) / 2000 * min(t[ends[-1]], motion.duration)
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()
     mean_forces = [float(press[run.find_columns(name, scene)].sum()) for name in motion.contacts]
-    rows = zip(motion.contacts, planned, mean_forces, strict=True)
-    return [Force(part.phase.number, *row) for row in rows]
+    means = zip(motion.contacts, planned, mean_forces, strict=True)
+    return [Force(phase.number, *mean) for mean in means]
 
 
 def _list_changes(
-    problem: Problem, part: _Part, run: EngineRun, reach: float
+    phase: Phase, want: Samples, rows: NDArray[np.int64], run: EngineRun, reach: float
 ) -> Iterator[tuple[float, float, str]]:
     """Deviations of contacts from the plan in a phase: their intervals [s], and in words."""
-    scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
+    formation, scales = phase.formation, phase.formation.scene.scales
     flags = list[tuple[str, NDArray[np.bool_], Array]]()
     t, moves = run.t[rows], 2e-3 * scales.speed
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
-    planned = formation.evaluate(part.want.z, part.want.z_dot)
+    planned = formation.evaluate(want.z, want.z_dot)
     slides = np.einsum("nij,nj->ni", actual.A_t, run.z_dot[rows])
-    meant = np.einsum("nij,nj->ni", planned.A_t, part.want.z_dot)
+    meant = np.einsum("nij,nj->ni", planned.A_t, want.z_dot)
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
-        pressing[:, run.find_columns(name, problem.scene)] = 0.0
+        pressing[:, run.find_columns(name, formation.scene)] = 0.0
         flags.append((f"{name} opens", actual.C[:, k] > 0.1 * reach, t))
         slide, planned_slide = np.abs(slides[:, k]), np.abs(meant[:, k])
         if k in formation.rolling_rows:

@@ -35,7 +35,6 @@ from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
 from ..scene.model import TURN, Polygon, Scene, check_place
 from .borders import (
-    Piece,
     Track,
     Window,
     cut,
@@ -200,9 +199,8 @@ class Part(NamedTuple):
     contacts: tuple[Contact, ...]
     start: Array  # start, stop (2,) [m, rad]: x and phi at its ends
     stop: Array
-    gained: tuple[Contact, ...]  # at its end; empty where it ends inside a cell
+    gained: tuple[Contact, ...]  # at its end; empty where it ends inside a cell, or at an obstacle
     coordinate: int  # {0, 1}: x or phi, whichever changes more
-    inside: Array  # (2,) [m, rad]: end without a gained contact: `stop`, or before an obstacle
 
 
 Walked = tuple[Step, Array]  # a phase, and the configuration at its end
@@ -260,9 +258,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
             continue
         if len(part.contacts) == 4:
             # A contact may be gained in both directions along a border.
-            pose = end[[0, 2]]
-            away = np.minimum(np.abs(pose - part.stop), np.abs(pose - part.inside))
-            if not (away < tolerance(scene)).all():
+            if not (np.abs(end[[0, 2]] - part.stop) < tolerance(scene)).all():
                 text = f"{steps[-1][1]} is first reached at {describe_pose(end)}"
                 first = first or InputError("", "", text)
                 continue
@@ -281,10 +277,8 @@ def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
 
 def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
     """Candidate phases for a part from `z`, the simplest first."""
-    simple: list[list[Step]] = [[(part.contacts, Until(contact=c))] for c in part.gained]
-    ends: list[list[Step]] = list(simple) or [[]]
-    if not part.gained or (part.inside != part.stop).any():
-        simple.append([(part.contacts, end_at(scene, part.coordinate, part.inside))])
+    gains = [[(part.contacts, Until(contact=c))] for c in part.gained]
+    simple = gains or [[(part.contacts, end_at(scene, part.coordinate, part.stop))]]
     if last and len(part.contacts) == 3:
         # One phase with terminal constraints on the pose.
         pose = [end_at(scene, row, part.stop) for row in (0, 1)]
@@ -308,7 +302,7 @@ def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list
     between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(between, count):
-            yield from ([*chosen, *end] for end in ends)
+            yield from ([*chosen, *end] for end in gains or [[]])
 
 
 def end_at(scene: Scene, row: int, pose: Array) -> Until:
@@ -345,7 +339,14 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
         for piece in cut(scene, [leg.track])
         if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
     ]
-    _require_reached(scene, leg, kept, [low + near, high - near])
+    reached = [float(s) for piece in kept for s in piece.places[[0, -1]]]
+    ends = [low + near, *reached, high - near]
+    for before, after in zip(ends[::2], ends[1::2], strict=True):
+        if after - before > 1e-6 * leg.near:
+            pose = leg.at((before + after) / 2)
+            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
+            text = text or "there the border has ended"
+            raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
     spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
     # The ends of shorter parts are one crossing.
     spans = [span for span in spans if span[2] - span[1] > 1e-3 * leg.near] or spans
@@ -371,7 +372,6 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
         mine = name_contacts(table, label)
         begin, end = leg.at(first), leg.at(last)
         gained: tuple[Contact, ...] = ()
-        inside = end
         if index + 1 < len(spans):
             following = name_contacts(table, spans[index + 1][0])
             gained = tuple(c for c in following if c not in mine)
@@ -383,11 +383,12 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             z = close_fingers(scene, end[:1], end[1:]).z[0]
             touching = find_touching(scene, z) if np.isfinite(z).all() else ()
             gained = tuple(c for c in touching if c not in mine)
-            inside = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
+            if not gained:
+                end = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
         coordinate = int((np.abs(end - begin) / near).argmax())
         if leg.track.flush is not None:
             coordinate = 0 if leg.track.flush[0] is None else 1
-        parts.append(Part(mine, begin, end, gained, coordinate, inside))
+        parts.append(Part(mine, begin, end, gained, coordinate))
     return parts
 
 
@@ -416,16 +417,6 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
     return kept
 
 
-def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
-    ends = [ends[0], *(float(s) for piece in kept for s in piece.places[[0, -1]]), ends[1]]
-    for before, after in zip(ends[::2], ends[1::2], strict=True):
-        if after - before > 1e-6 * leg.near:
-            pose = leg.at((before + after) / 2)
-            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
-            text = text or "there the border has ended"
-            raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
-
-
 @dataclass(frozen=True, eq=False)
 class Leg:
     """A curve in the (x, phi) plane."""
@@ -449,8 +440,8 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
     """The border that both ends are near, or a straight line."""
     candidates = []
     for leg, off in _list_near(scene, start, stop):
-        flush = leg.track.flush
-        if off < 1 and (flush is None or flush[0] is None):
+        assert leg.track.flush is not None
+        if off < 1 and leg.track.flush[0] is None:
             return leg
         if off < 1:
             # Both ends have to be near the same piece of the curve, or near one each.

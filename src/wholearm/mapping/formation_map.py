@@ -51,9 +51,8 @@ from .borders import (
 )
 from .formation_list import trace_problem
 
-WAYS = ("+x", "-x", "+phi", "-phi")  # directions of travel inside a cell
+WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # travel inside a cell: x, phi
 REGULAR = 1e-9  # least ratio of singular values of independent contacts; least determinant likewise
-_WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 Flush = tuple[int | None, int]  # a finger (None for the palm) and an edge that lies flush on it
 CROSSED = -5  # cell of the places where the closed fingers would overlap
 NODES = 24  # intervals of a border
@@ -193,7 +192,16 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     if flush.any():
         rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
-        flags[:, flush] = _check_borders(problem, chosen, z[flush], rows, limit)
+        kinematics = evaluate_each(scene, chosen, z[flush])
+        weights = np.sqrt(metric_weights(scene))
+        _, sizes, right = np.linalg.svd(kinematics.A / weights)
+        z_s = right[:, -1] / weights
+        z_s *= np.where(z_s[np.arange(len(rows)), rows] < 0, -1.0, 1.0)[:, None]
+        regular = sizes[:, -1] > REGULAR * sizes[:, 0]
+        tangents = np.stack([z_s, -z_s], axis=1)
+        motions = problem, chosen, z[flush], kinematics, regular, tangents, limit
+        possible, flags[2, flush] = _check_motions(*motions)
+        flags[:2, flush] = possible.T
     table, borders = contact_table(scene), []
     for index, piece in enumerate(pieces):
         mine = owner == index
@@ -238,24 +246,6 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     return tuple(crossings)
 
 
-def _check_borders(
-    problem: Problem, labels: Numbers, z: Array, rows: Numbers, limit: float
-) -> tuple[Flags, Flags, Flags]:
-    """Whether motions along borders are feasible, with rows of z increasing and decreasing, (n,).
-
-    And where contact forces of one that would be are not unique.
-    """
-    scene, weights = problem.scene, np.sqrt(metric_weights(problem.scene))
-    kinematics = evaluate_each(scene, labels, z)
-    _, sizes, right = np.linalg.svd(kinematics.A / weights)
-    z_s = right[:, -1] / weights
-    z_s *= np.where(z_s[np.arange(len(z)), rows] < 0, -1.0, 1.0)[:, None]
-    regular = sizes[:, -1] > REGULAR * sizes[:, 0]
-    tangents = np.stack([z_s, -z_s], axis=1)
-    possible, ambiguous = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
-    return possible[:, 0], possible[:, 1], ambiguous
-
-
 def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> tuple[Flags, Flags]:
     """Whether motions inside cells are feasible in the directions `WAYS`, (n, 4).
 
@@ -266,7 +256,7 @@ def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> t
     matrix = np.concatenate([kinematics.A, pose], axis=1)
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     tangents = np.zeros((len(z), len(WAYS), 5))
-    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ _WAYS.T).swapaxes(1, 2)
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
     return _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
 
 

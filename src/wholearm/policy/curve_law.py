@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite, sqrt
+from math import ceil, inf, isfinite, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,8 +69,9 @@ class LawSettings:
 
 
 LAW = LawSettings()
-Rows = list[list[float]]
-Levels = tuple[list[float], list[float], list[float]]  # and their coefficients of a and lambda
+Row = tuple[float, ...]  # a limit or a torque, and its coefficients of a and internal force
+Ends = list[list[list[float]]]
+"""Of each row of an interval the five coefficients at its start, and their change to its end."""
 
 
 class CurveLaw:
@@ -88,11 +89,17 @@ class CurveLaw:
     ----------
     over, pushes  whether the next phase may begin, and whether the contact has been made
     passed        how many of the phases have been passed
-    after         the law of the next phase, if it is along a curve
+    turn          first chord of the next law, if it is along a curve and entered in motion
+    brake, after  the next law, if it is along a curve: while `push` is held, or otherwise
     s, v, level   arc length, speed and least level at the last step
     """
 
-    def __init__(self, tables: Mapping[str, Any], settings: LoopSettings) -> None:
+    def __init__(
+        self,
+        tables: Mapping[str, Any],
+        settings: LoopSettings,
+        following: CurveLaw | MotionLaw | None = None,
+    ) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
         self.starts = list(tables.get("starts", ())) or [0.0]
@@ -110,26 +117,17 @@ class CurveLaw:
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
         # Speeds by chords would step at nodes where joint angles bend. Case: hexagon, phase 5.
         self.slopes = np.gradient(tables["theta"], tables["s"], axis=0).tolist()
-        self.levels, self.level_rises = _split(tables["levels"], most=1e6)
-        self.torque, self.torque_rises = _split(tables["torque"])
+        self.levels, self.torque = _split(tables["levels"], most=1e6), _split(tables["torque"])
         self.floor = self._find_floor()
         self.gain = LAW.gain / (settings.period + settings.delay)
         self.memory = LAW.integral * self.gain**2 * settings.period
         self.beyond = LAW.beyond * settings.touch
-        self.turn: tuple[float, float] | None = None
-        self.after: CurveLaw | None = None
-        self.brake: CurveLaw | None = None
+        follower = following if isinstance(following, CurveLaw) else None
+        self.turn = follower.chords[0] if follower and self.passes else None
+        self.brake = follower if self.keeps and not self.passes else None
+        self.after = follower if not self.keeps and not self.passes else None
         self.sensing: Sensing | None = None
         self.begin()
-
-    def lead_to(self, after: CurveLaw) -> None:
-        """Set the next law."""
-        if self.passes:
-            self.turn = after.chords[0]
-        elif self.keeps:
-            self.brake = after
-        else:
-            self.after = after
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
@@ -202,8 +200,7 @@ class CurveLaw:
         """Torques that bring the joints to rest, without those that press contacts [N m]."""
         self._measure(theta, rates)
         j, share = self._locate(self.j, self.s)
-        rows = zip(self.torque[j], self.torque_rises[j], strict=True)
-        one, two = (before[3] + share * rise[3] for before, rise in rows)
+        (_, one, _), (_, two, _) = _evaluate(self.torque[j], share, self.v)
         return -self.gain * self.v * one, -self.gain * self.v * two
 
     def _is_made(self, s: float, v: float) -> bool:
@@ -271,39 +268,27 @@ class CurveLaw:
         for j, h in enumerate(self.steps):
             ends = self.b[j : j + 2]
             a = (ends[1] - ends[0]) / (2 * h)
-            rows = [self._list_levels(j, k, sqrt(b)) for k, b in enumerate(ends)]
-            level = min(choose_internal_force(*each, a)[0] for each in rows)
+            rows = [_evaluate(self.levels[j], k, sqrt(b)) for k, b in enumerate(ends)]
+            level = min(_choose_at(each, a)[0] for each in rows)
             floors.append(min(LAW.level, LAW.part * level))
         return floors
 
-    def _list_levels(self, j: int, share: float, v: float) -> Levels:
-        """Levels at a place and a speed, and their coefficients of a and internal force."""
-        return _evaluate(self.levels[j], self.level_rises[j], share, v)
-
-    def _list_torques(self, j: int, share: float, v: float) -> list[tuple[float, float, float]]:
-        """Torques at a place and a speed, each with its coefficients of a and internal force."""
-        return list(zip(*_evaluate(self.torque[j], self.torque_rises[j], share, v), strict=True))
-
     def _list_levels_across(
-        self, torques: Sequence[tuple[float, float, float]], j: int, share: float, v: float
-    ) -> Levels:
-        """As `_list_levels`, of another place under torques that are affine in this one's a."""
-        base, rates, press = self._list_levels(j, share, v)
-        (p, d, e), (q, f, g) = self._list_torques(j, share, v)
+        self, torques: Sequence[Row], j: int, share: float, v: float
+    ) -> list[Row]:
+        """Levels at another place under torques that are affine in this one's a."""
+        (p, d, e), (q, f, g) = _evaluate(self.torque[j], share, v)
         size = d * g - e * f
         if abs(size) <= SAME * (abs(d * g) + abs(e * f)):
-            return [], [], []
+            return []
         # a and internal force there, of 1, a and internal force here
-        pairs = list(zip(*torques, strict=True))
-        pairs[0] = pairs[0][0] - p, pairs[0][1] - q
-        a = [(g * one - e * two) / size for one, two in pairs]
-        internal = [(d * two - f * one) / size for one, two in pairs]
-        every = list(zip(base, rates, press, strict=True))
-        base, rates, press = (
-            [(k == 0) * level + rate * a[k] + by * internal[k] for level, rate, by in every]
-            for k in range(3)
-        )
-        return base, rates, press
+        (first, *rest) = zip(*torques, strict=True)
+        pairs = [(first[0] - p, first[1] - q), *rest]
+        motions = [((g * t - e * u) / size, (d * u - f * t) / size) for t, u in pairs]
+        return [
+            tuple((k == 0) * level + rate * a + by * press for k, (a, press) in enumerate(motions))
+            for level, rate, by in _evaluate(self.levels[j], share, v)
+        ]
 
     def _act(
         self,
@@ -320,13 +305,12 @@ class CurveLaw:
         Where it keeps them too little it is moved towards that of some `planned` that keeps them
         best. Limits of the interval `across` a border are kept by the same torques.
         """
-        rows, torques = self._list_levels(j, share, v), self._list_torques(j, share, v)
+        rows, torques = (_evaluate(table[j], share, v) for table in (self.levels, self.torque))
         wanted, floor = a, self.floor[j]
         a, level, internal = _choose_motion(rows, planned, wanted, floor)
         if across is not None:
-            more = self._list_levels_across(torques, across, float(across < j), v)
-            base, rates, press = (one + two for one, two in zip(rows, more, strict=True))
-            both = _choose_motion((base, rates, press), planned, wanted, floor)
+            rows += self._list_levels_across(torques, across, float(across < j), v)
+            both = _choose_motion(rows, planned, wanted, floor)
             # Where none keep both, the longer part counts. Case: query 32, phase 6.
             if both[1] > 0.0:
                 a, level, internal = both
@@ -364,45 +348,49 @@ class CurveLaw:
         return tau
 
 
-def _evaluate(first: Rows, rises: Rows, share: float, v: float) -> Levels:
-    """Rows of an interval at a share of it and a speed, and their coefficients."""
+def _evaluate(rows: Ends, share: float, v: float) -> list[Row]:
+    """Rows of an interval at a share of it and a speed."""
     b = v * v
-    base, rates, press = [], [], []
-    for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(first, rises, strict=True):
-        base.append(c + share * d + (cb + share * db) * b + (cv + share * dv) * v)
-        rates.append(ca + share * da)
-        press.append(cl + share * dl)
-    return base, rates, press
+    return [
+        (
+            c + share * d + (cb + share * db) * b + (cv + share * dv) * v,
+            ca + share * da,
+            cl + share * dl,
+        )
+        for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in rows
+    ]
+
+
+def _choose_at(rows: Sequence[Row], a: float) -> tuple[float, float]:
+    """Max-min level for an acceleration, and its internal force."""
+    return choose_internal_force([(base + by_a * a, by) for base, by_a, by in rows])
 
 
 def _choose_motion(
-    rows: Levels, planned: Sequence[float], a: float, floor: float
+    rows: Sequence[Row], planned: Sequence[float], a: float, floor: float
 ) -> tuple[float, float, float]:
     """a, the least level and the internal force, with a moved to one planned below the floor."""
-    level, internal = choose_internal_force(*rows, a)
+    level, internal = _choose_at(rows, a)
     if level >= floor:
         return a, level, internal
-    (safe, other), best = max((choose_internal_force(*rows, one), one) for one in planned)
+    (safe, other), best = max((_choose_at(rows, one), one) for one in planned)
     if safe > floor:
         # The least level is concave in a: this interpolation keeps the floor.
         a = best + (safe - floor) / (safe - level) * (a - best)
-        return (a, *choose_internal_force(*rows, a))
+        return (a, *_choose_at(rows, a))
     return (best, safe, other) if safe > level else (a, level, internal)
 
 
-def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows]]:
-    """Rows at the start of each interval and their differences, without ignored ones.
+def _split(table: Any, most: float = inf) -> list[Ends]:
+    """Rows of each interval at its start and their changes to its end, without ignored ones.
 
     Coefficients of the internal force that are 0 but for rounding are 0.
     """
     size, table = abs(table[..., 4]), table.copy()
     table[..., 4][size <= 1e-9 * size.max(initial=0.0)] = 0.0
-    first, rises = table[:, 0], table[:, 1] - table[:, 0]
-    if most is None:
-        return first.tolist(), rises.tolist()
-    counts = table[:, :, :, 0].min(axis=1) < most
-    kept = [[r[k].tolist() for r, k in zip(a, counts, strict=True)] for a in (first, rises)]
-    return kept[0], kept[1]
+    pairs = np.stack([table[:, 0], table[:, 1] - table[:, 0]], axis=2)
+    kept = table[..., 0].min(axis=1) < most
+    return [rows[k].tolist() for rows, k in zip(pairs, kept, strict=True)]
 
 
 class LoopSettings(NamedTuple):
@@ -437,7 +425,12 @@ class MotionLaw:
 
     passes = False
 
-    def __init__(self, tables: Mapping[str, Any], settings: LoopSettings) -> None:
+    def __init__(
+        self,
+        tables: Mapping[str, Any],
+        settings: LoopSettings,
+        following: CurveLaw | MotionLaw | None = None,
+    ) -> None:
         self.settings, self.starts = settings, tables["starts"].tolist()
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
         self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
@@ -446,8 +439,8 @@ class MotionLaw:
         self.ways = tables["ways"].tolist()
         self.end = self.every * (len(self.theta) - 1)
         self.lands = len(self.ways) < 2  # a contact that is gained leaves less free
-        # The next law, if along a curve: it presses its contacts before it begins.
-        self.after: CurveLaw | None = None
+        # It presses its contacts before it begins.
+        self.after = following if isinstance(following, CurveLaw) else None
         self.begin()
 
     def begin(self, at_end: bool = False) -> None:
@@ -545,8 +538,7 @@ class Sensing:
         self, names: Sequence[Sequence[str]], gained: str, table: Any, late: float
     ) -> None:
         self.names, self.gained = tuple(names), gained
-        self.first = table[:, 0].tolist()
-        self.rises = (table[:, 1] - table[:, 0]).tolist()
+        self.forces = _split(table)
         self.lag = max(ceil(late - 1e-9), 1)
         self.begin()
 
@@ -581,45 +573,30 @@ class Sensing:
         `place` has the interval, the share of it, s', a and the internal force of the law.
         """
         j, share, v, a, internal = place
-        plain, press = [], []
-        for (c, cb, _, ca, cl), (d, db, _, da, dl) in zip(
-            self.first[j], self.rises[j], strict=True
-        ):
-            by = cl + share * dl
-            force = c + share * d + (cb + share * db) * v * v + (ca + share * da) * a
-            plain.append(force + by * internal)
-            press.append(by)
+        rows = _evaluate(self.forces[j], share, v)
+        plain = [base + by_a * a + by * internal for base, by_a, by in rows]
+        press = [by for _, _, by in rows]
         least = LAW.few * sum(abs(f) for f in plain) / len(plain)
         sizes = [max(f, least) or 1.0 for f in plain]
-        parts = [(f + off) / size for f, off, size in zip(plain, self.bias, sizes, strict=True)]
-        rates = [f / size for f, size in zip(press, sizes, strict=True)]
-        change = min(max(self._choose(parts, rates), low), high)
+        entries = zip(plain, press, self.bias, sizes, strict=True)
+        ratios = [((f + off) / size, by / size) for f, by, off, size in entries]
+        # The least change with which all ratios are at least 1, or else the max-min one.
+        lower = max([(1.0 - part) / rate for part, rate in ratios if rate > 0.0], default=-1e30)
+        upper = min([(1.0 - part) / rate for part, rate in ratios if rate < 0.0], default=1e30)
+        nearest = min(max(0.0, lower), upper)
+        change = nearest if lower <= upper else choose_internal_force(ratios)[1]
+        change = min(max(change, low), high)
         self.expected.append([f + by * change for f, by in zip(plain, press, strict=True)])
         return change
 
-    def _choose(self, parts: list[float], rates: list[float]) -> float:
-        """The least change with which all ratios are at least 1, or else the max-min one."""
-        low, high = -1e30, 1e30
-        for part, rate in zip(parts, rates, strict=True):
-            if rate > 0.0:
-                low = max(low, (1.0 - part) / rate)
-            elif rate < 0.0:
-                high = min(high, (1.0 - part) / rate)
-        if low <= high:
-            return min(max(0.0, low), high)
-        return choose_internal_force(parts, [0.0] * len(parts), rates, 0.0)[1]
 
-
-def choose_internal_force(
-    base: Sequence[float], rates: Sequence[float], press: Sequence[float], a: float
-) -> tuple[float, float]:
-    """Max-min level of limits base + rates a + press lambda, and its internal force lambda.
+def choose_internal_force(lines: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Max-min level of limits p + q lambda, given as (p, q), and its internal force lambda.
 
     Active-set method: the optimum is where a rising and a falling line meet; the least line there
     replaces one of them until none is less. Limits that lambda does not change bound the level
     only: lambda is the same whether they are active or not.
     """
-    lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
     ups = [line for line in lines if line[1] > 0.0]
     downs = [line for line in lines if line[1] < 0.0]
     flat = min([p for p, q in lines if q == 0.0], default=1e30)

@@ -197,15 +197,6 @@ def have_same_signs(before: Directions, after: Directions) -> Array:
     return np.asarray(same[0] & same[1])
 
 
-def leave_one(levels: Array) -> Array:
-    """Levels of intervals, (n, 2, m, 5), without duplicates."""
-    distinct_levels = levels.copy()
-    for k in range(1, levels.shape[2]):
-        twice = (distinct_levels[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
-        distinct_levels[twice, :, k] = UNLIMITED
-    return distinct_levels
-
-
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
     """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
     first = curve.segments[0]
@@ -301,7 +292,11 @@ class Within(NamedTuple):
 
     def at(self, motion: PathMotion) -> tuple[CurveLimitRows, Array, Array]:
         """The law's limits near a motion; those of the reference, and their margins."""
-        motions = self._spread(motion)
+        # With its internal force, and with the least and largest one within torques.
+        a, b, internal = motion
+        ends = PathLimits(self.left, b).find_internal_force_range(a, b)
+        low, high = (np.where(np.isfinite(end), end, internal) for end in ends)
+        motions = [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
         forces = self._pick(self.sides, motions)
         closed = self._pick([side.close(self.left) for side in self.sides], motions)
         slack = np.concatenate([forces, self.left], axis=1)
@@ -321,13 +316,6 @@ class Within(NamedTuple):
         ]
         limits[1][self.same] = UNLIMITED
         return np.concatenate(limits, axis=1)
-
-    def _spread(self, motion: PathMotion) -> list[PathMotion]:
-        """A motion with its internal force, and with the least and largest one within torques."""
-        a, b, internal = motion
-        ends = PathLimits(self.left, b).find_internal_force_range(a, b)
-        low, high = (np.where(np.isfinite(end), end, internal) for end in ends)
-        return [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
 
 
 def find_within(
@@ -606,12 +594,15 @@ def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str
     c_n = inverse(formation, *point[:3], mean, point.kinematics).of_c[:, : formation.n_contacts]
     tables = rows.levels, rows.torque, c_n
     levels, torque, forces = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
+    # Of equal limits of an interval one is enough.
+    equal = (levels[:, :, :, None] == levels[:, :, None]).all(axis=(1, 4))
+    levels.swapaxes(1, 2)[np.tril(equal, -1).any(axis=2)] = UNLIMITED
     return {
         "starts": np.zeros(1),
         "s": rows.s,
         "theta": point.z[:, 3:],
         "b": piece.b,
-        "levels": leave_one(levels)[..., COLUMNS],
+        "levels": levels[..., COLUMNS],
         "torque": torque[..., COLUMNS],
         "push": push,
         "passes": np.array([piece.passes]),
@@ -755,8 +746,7 @@ def make_policy(
                 entry["duration"] += settings.dwell + delay
         about += entries
     duration = sum(phase["duration"] for phase in about)
-    whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
-    whole["problem"] = given
+    whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:
         whole.update(ranges=dict(ranges), reserve=reserve)
     return Policy(tables, settings, whole)

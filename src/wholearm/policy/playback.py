@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from itertools import chain, pairwise
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -73,15 +73,10 @@ class Policy(Result):
         sensor: bool = False,
     ) -> None:
         self.tables, self.settings, self.about = tuple(tables), settings, dict(about or {})
-        self.laws = tuple(
-            CurveLaw(arrays, settings) if "s" in arrays else MotionLaw(arrays, settings)
-            for arrays in self.tables
-        )
-        for law, after in pairwise(self.laws):
-            if isinstance(after, CurveLaw) and isinstance(law, CurveLaw):
-                law.lead_to(after)
-            elif isinstance(after, CurveLaw):
-                law.after = after
+        self.laws = list[Law]()
+        for arrays in reversed(self.tables):
+            kind = CurveLaw if "s" in arrays else MotionLaw
+            self.laws.insert(0, kind(arrays, settings, self.laws[0] if self.laws else None))
         self.sensor = sensor
         self.last = len(self.laws) - 1 if laws is None else laws - 1
         counts = [len(law.starts) for law in self.laws[: self.last + 1]]

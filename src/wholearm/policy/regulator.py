@@ -113,9 +113,8 @@ def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array
     `levels`, (n, m, 5), are limits over their margins, linear in (1, a, b, s', internal force).
     """
     base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
-    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
-    best = [choose_internal_force(one, [0.0] * len(one), by, 0.0) for one, by in pairs]
-    level, internal = np.array(best).T
+    lines = np.stack([base, levels[..., LAMBDA]], axis=2).tolist()
+    level, internal = np.array([choose_internal_force(each) for each in lines]).T
     return level, internal
 
 
@@ -168,7 +167,11 @@ def follow(
 
 
 def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
-    """Stretches with constant contact modes at instants of a phase of a plan."""
+    """Stretches with constant contact modes at instants of a phase of a plan.
+
+    Accelerations and forces are those of the torques: between the samples of a loaded plan they
+    step where modes change.
+    """
     spans, names = list_modes(phase, plan), phase.formation.names
     begins = [span["start"] for span in spans[1:]]
     owner = np.searchsorted(begins, t - plan.phase_starts[phase.index], side="right")
@@ -176,30 +179,21 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         modes = [spans[k]["contacts"][name] for name in names]
         pairs = zip(phase.formation.contacts, modes, strict=True)
         rolling = tuple(contact for contact, mode in pairs if mode == "rolls")
-        signs = [SIGNS[mode] for mode in (*modes, *spans[k]["joints"])]
-        formation = replace(phase.formation, rolling=rolling)
-        yield _stretch(formation, np.array(signs), plan, t[owner == k])
-
-
-def _stretch(formation: Formation, signs: Array, plan: Trajectory, t: Array) -> RegulatedStretch:
-    """A part of a plan at n instants, by the directions of contacts and joints, (n_c + 2,).
-
-    Accelerations and forces are those of the torques: between the samples of a loaded plan they
-    step where modes change.
-    """
-    samples = plan.at(t)
-    z, v = samples.z, samples.z_dot
-    directions = Directions(*np.split(np.tile(signs, (len(t), 1)), [formation.n_contacts], axis=1))
-    forward = Batch(build_forward(formation))
-    acceleration, _, _ = forward(z, v, plan.torque.at(t), *directions)
-    kinematics = formation.evaluate(z, v)
-    forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
-    limits = make_limits(formation, 0.0).without(SPEED)
-    weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
-    torque = np.isin(limits.sides[0], limits.of(TORQUE))
-    margins = np.where(torque, ROOM, PRESS * weights)
-    levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
-    return RegulatedStretch(formation, z, v, directions, forces, levels)
+        formation, times = replace(phase.formation, rolling=rolling), t[owner == k]
+        signs = np.tile([SIGNS[mode] for mode in (*modes, *spans[k]["joints"])], (len(times), 1))
+        directions = Directions(*np.split(signs, [formation.n_contacts], axis=1))
+        samples = plan.at(times)
+        z, v = samples.z, samples.z_dot
+        forward = Batch(build_forward(formation))
+        acceleration, _, _ = forward(z, v, plan.torque.at(times), *directions)
+        kinematics = formation.evaluate(z, v)
+        forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
+        limits = make_limits(formation, 0.0).without(SPEED)
+        weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
+        torque = np.isin(limits.sides[0], limits.of(TORQUE))
+        margins = np.where(torque, ROOM, PRESS * weights)
+        levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
+        yield RegulatedStretch(formation, z, v, directions, forces, levels)
 
 
 def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
@@ -270,8 +264,7 @@ def regulate(linearizations: list[Linear], step: float) -> Array:
     from scipy.linalg import cholesky, solve_continuous_are
 
     gains, P, after = np.zeros((len(linearizations), 2, 4)), np.zeros((0, 0)), list[int]()
-    for k in range(len(linearizations) - 1, -1, -1):
-        linear = linearizations[k]
+    for k, linear in reversed(list(enumerate(linearizations))):
         N, f = linear.N, linear.N.shape[1]
         Q = np.kron(np.diag([RATE**4, 2 * RATE**2]), linear.metric)
         inputs = np.vstack([np.zeros((f, 2)), linear.B])
@@ -310,7 +303,11 @@ def tabulate_motion(
     b, tau, gains, slow = follow(problem, phases, plan, t)
     speed = np.sqrt(b)
     still = STILL * problem.scene.scales.rate
-    ways = _list_free_joints(problem, last, samples.z[-1:])
+    # Orthonormal basis of the joint displacements that the contacts at the end leave free.
+    both = last.formation.add(last.until.contact)
+    left = _span(both, both.evaluate(samples.z[-1:], np.zeros((1, 5))).P)[0].T
+    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
+    ways = basis.T[sizes > 1e-3 / np.sqrt(metric_weights(problem.scene))[3]]
     # Towards the contact, across what it leaves free.
     heading = samples.z[-1, 3:] - samples.z[-2, 3:]
     heading = heading - ways.T @ (ways @ heading)
@@ -327,15 +324,6 @@ def tabulate_motion(
         "still": np.array([still]),
         "ways": ways,
     }
-
-
-def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
-    """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
-    both = phase.formation.add(phase.until.contact)
-    left = _span(both, both.evaluate(z, np.zeros_like(z)).P)[0].T
-    units = np.sqrt(metric_weights(problem.scene))
-    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
-    return np.asarray(basis.T[sizes > 1e-3 / units[3]])
 
 
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
@@ -423,41 +411,35 @@ def _replan_blocks(
 
     Those with several freedoms last at most `longest` times as long.
     """
-    starts, phases = plan.phase_starts, list[PlannedPhase]()
+    starts, phases, scene = plan.phase_starts, list[PlannedPhase](), problem.scene
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
     for block in blocks:
         curve = runs_on_curves(block)
-        part = _solve(planner, problem, block, z, 0.0 if curve else share)
+        margin = 0.0 if curve else share
+        ease = 1 - margin * ROOM
+        one, two = (replace(f, torque_limit=ease * f.torque_limit) for f in scene.fingers)
+        tightened = replace(
+            problem,
+            start=z,
+            epsilon=max(problem.epsilon, margin * PRESS * scene.scales.force),
+            scene=replace(scene, fingers=(one, two)),
+            phases=tuple(replace(phase, index=k) for k, phase in enumerate(block)),
+        )
+        try:
+            part = planner(tightened)
+        except WholearmError:
+            return []
         lasts = starts[block[-1].index + 1] - starts[block[0].index]
-        if part is None or (not curve and part.duration > longest * lasts):
+        if not curve and part.duration > longest * lasts:
             return []
         phases += list_phases(part)
         z = part.z[-1]
         away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
-        away[:2] /= problem.scene.scales.length
+        away[:2] /= scene.scales.length
         if away.max() < SAME:
             return phases
     return []
-
-
-def _solve(
-    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
-) -> Trajectory | None:
-    """Plan of phases from a configuration at rest, with a share of the margin."""
-    scene, ease = problem.scene, 1 - share * ROOM
-    one, two = (replace(f, torque_limit=ease * f.torque_limit) for f in scene.fingers)
-    tightened = replace(
-        problem,
-        start=z,
-        epsilon=max(problem.epsilon, share * PRESS * scene.scales.force),
-        scene=replace(scene, fingers=(one, two)),
-        phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
-    )
-    try:
-        return planner(tightened)
-    except WholearmError:
-        return None
 
 
 def _pin(phase: Phase, z: Array) -> Phase:

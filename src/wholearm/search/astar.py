@@ -18,6 +18,8 @@ from itertools import count, pairwise, takewhile
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, cast
 
+import numpy as np
+
 from ..common.parallel import Task, share
 from ..common.signals import Reporter, beat
 from ..contacts.elemental import Contact
@@ -25,7 +27,7 @@ from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
-from ..problem.definition import Goal, Phase, Problem
+from ..problem.definition import End, Goal, Phase, Problem, Until
 from .edge_plans import (
     CoarsePlan,
     Lost,
@@ -39,9 +41,9 @@ from .edge_plans import (
     split_route,
     time_with,
 )
-from .edges import ROUGHLY, Blocked, Edge, describe_steps, leave_at
+from .edges import ROUGHLY, Blocked, Edge, EdgeStep, describe_steps, point_out
 from .places import Key, RoadmapPlace, is_at
-from .roadmap import Chain, Roadmap
+from .roadmap import Roadmap
 
 CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
 OFTEN = 2  # expansions of one place, on different routes
@@ -112,12 +114,6 @@ class Route:
         return tuple((frozenset(step.contacts), step.end) for step in steps)
 
 
-Pending = Chain | Callable[[], list[Edge]] | None
-"""What is looked at when a route is taken from the queue, beside the place to which it leads: the
-chain with which it may go on without a stop; or instead of the place edges that are costly to find.
-"""
-
-
 @dataclass(eq=False)
 class RouteSearch:
     """Routes from a start to a goal."""
@@ -142,6 +138,8 @@ class RouteSearch:
         """Yield new routes, about in the order of their durations."""
         time = self.roadmap.scene.scales.time
         number, times = count(), Counter[Key]()  # times: expansions of places
+        # Looked at in place of where the route leads: edges from there that are costly to find.
+        Pending = Callable[[], list[Edge]] | None
         queue = list[tuple[float, int, Route, Pending]]()
 
         def push(route: Route, pending: Pending = None, more: float = 0.0) -> None:
@@ -157,7 +155,7 @@ class RouteSearch:
             least, _, route, pending = heapq.heappop(queue)
             if least > self.limit or len(times) > heuristic.most:
                 return
-            if callable(pending):
+            if pending:
                 edges = pending()
                 for edge in (*edges, *self.roadmap.land_at(edges, self.goal)):
                     push(route.extend(edge))
@@ -168,19 +166,19 @@ class RouteSearch:
                     self.found.add(route.key)
                     yield route
                 continue
-            if pending is not None:
+            if route.edges and (chain := route.edges[-1].chain):
                 before = Route(route.start, route.edges[:-1])
-                for edge, chain in self.roadmap.go_on(pending, self.goal):
-                    push(before.extend(edge), chain)
+                for edge in self.roadmap.go_on(chain, self.goal):
+                    push(before.extend(edge))
             if times[place.key] >= (1 if place.landed else OFTEN):
                 continue
             times[place.key] += 1
             self.reached.setdefault(place.key, route)
-            for candidate, chain in self.roadmap.set_out(place, self.goal):
+            for candidate in self.roadmap.set_out(place, self.goal):
                 if self._is_back(route, candidate.steps[0].contacts):
                     continue
                 if isinstance(candidate, Edge):
-                    push(route.extend(candidate), chain)
+                    push(route.extend(candidate))
                 elif times[place.key] == 1 and candidate not in self.blocked:
                     self.blocked.append(candidate)
             if not place.landed:
@@ -207,16 +205,15 @@ class RefinedPath(NamedTuple):
 
 
 def search_release(
-    plan: Callable[[RefinedPath], CoarsePlan | None],
+    plan: Callable[[RefinedPath, CoarsePlan | None], CoarsePlan | None],
     best: CoarsePlan,
     to_go: CostToGo | None = None,
     known: Mapping[RefinedPath, CoarsePlan | None] = MappingProxyType({}),
-    go_on: Callable[[CoarsePlan], CoarsePlan | None] = lambda _: None,
 ) -> list[CoarsePlan]:
     """Pattern search for the place where an edge leaves a border: the fastest plan, then others.
 
-    By the least time of the edge and of a border that follows where it lands (`to_go`); `known` are
-    plans that were made before. From the fastest one with a stop `go_on` plans one without.
+    By the least time of the edge and of a border that follows where it lands (`to_go`). `plan`
+    plans a path, one without a stop also from a plan with one; `known` are plans made before.
     """
     least, tried, others = time_with(to_go, best), {RefinedPath(0)}, list[CoarsePlan]()
 
@@ -225,7 +222,7 @@ def search_release(
         if path in tried:
             return False
         tried.add(path)
-        return accept(known[path] if path in known else plan(path))
+        return accept(known[path] if path in known else plan(path, None))
 
     def accept(made: CoarsePlan | None) -> bool:
         """Keep a plan, if it is one; whether it is the fastest."""
@@ -249,17 +246,18 @@ def search_release(
         return path._replace(move=place)
 
     # In motion the planner chooses the place.
-    if not gains(RefinedPath(None)):
+    motion = RefinedPath(None)
+    if not gains(motion):
         path = shift(RefinedPath(0), STEPS[:-1])
         stopped = best
         # Cases: goals 10, 24, 33, 37, 46 and 51 of the corpus, 3 to 8 % faster; from the finest
         # place goals 0 and 16.
-        if not accept(go_on(stopped)):
+        if not accept(plan(motion, stopped)):
             path = shift(path, STEPS[-1:])
             if gains(path._replace(straight=False)):
                 shift(path._replace(straight=False), STEPS[1:])
             if best is not stopped:
-                accept(go_on(best))
+                accept(plan(motion, best))
     return [best, *others]
 
 
@@ -472,13 +470,12 @@ class RoutePlanner:
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
-            release, go_on = partial(self._release, edge), partial(self._go_on, edge)
-            searches[edge] = partial(search_release, release, plan, to_go, go_on=go_on)
+            searches[edge] = partial(search_release, partial(self._release, edge), plan, to_go)
         roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            made = self._share([partial(search.args[0], path) for path in paths])
+            made = self._share([partial(search.args[0], path, None) for path in paths])
             searches[edge] = partial(search, known=dict(zip(paths, made, strict=True)))
         results = self._share(list(searches.values()))
         for edge, (best, *others) in zip(searches, results, strict=True):
@@ -487,21 +484,32 @@ class RoutePlanner:
     def _share(self, tasks: Sequence[Task[T]], order: Sequence[int] = ()) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene), order)
 
-    def _release(self, edge: Edge, path: RefinedPath) -> CoarsePlan | None:
-        """Plan an edge that leaves its border at another place, or in motion."""
-        place = None if path.move is None else edge.share + FINEST * path.move
-        if place is not None and not INSIDE < place < 1 - INSIDE:
-            return None
-        # In motion the first guess has no plan in goal 48 of the corpus.
-        steps, first_only = leave_at(edge, place), place is not None
-        return plan_coarsely(
-            self.problem, edge, steps, self.options, straight=path.straight, first_only=first_only
-        )
+    def _release(
+        self, edge: Edge, path: RefinedPath, stopped: CoarsePlan | None
+    ) -> CoarsePlan | None:
+        """Plan an edge that leaves its border at another place; or in motion, from a plan if any.
 
-    def _go_on(self, edge: Edge, stopped: CoarsePlan) -> CoarsePlan | None:
-        """Plan an edge that leaves its border in motion from a plan that stops there."""
-        steps = leave_at(edge, None)
-        return plan_coarsely(self.problem, edge, steps, self.options, stopped=stopped)
+        That plan stops where it leaves the border.
+        """
+        first, *rest = edge.steps
+        step = EdgeStep(first.contacts, Until(), End.SMOOTH)
+        if path.move is not None:
+            place = edge.share + FINEST * path.move
+            if not INSIDE < place < 1 - INSIDE:
+                return None
+            assert edge.left is not None
+            z = edge.left.evaluate(np.array([place * edge.left.length])).z[0]
+            step = first._replace(until=point_out(first.contacts, z))
+        # In motion the first guess has no plan in goal 48 of the corpus.
+        return plan_coarsely(
+            self.problem,
+            edge,
+            (step, *rest),
+            self.options,
+            straight=path.straight,
+            first_only=path.move is not None,
+            stopped=stopped,
+        )
 
     def _is_lost(self, route: Route) -> bool:
         """Whether a route contains edges that had no plan on another one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,9 +19,10 @@ from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import NoMotionError, find_duration, make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import find_minors
+from ..planning.blocks import BEND, compute_curve_impact
 from ..planning.lower_bound import PathTerms, bound_least_time, bound_roughly, find_limits
-from ..problem.definition import End, Until
-from .places import RoadmapPlace, make_place
+from ..problem.definition import End, Goal, Phase, Until
+from .places import RoadmapPlace, make_place, measure_along
 
 INTERVALS = 24  # intervals of the speed sweep along a border
 FINE = 8  # times as many where it finds no motion
@@ -176,6 +177,8 @@ class Edge:
     share: float = 0.0  # the part of that which it follows
     borders: tuple[BorderEdge, ...] = ()  # those that it follows, if it leads through no cell
     ratios: tuple[float, ...] = ()  # their speed ratios, with which the speed is continuous
+    # these borders, where motions may go on beyond its end without a stop; none at a goal
+    chain: Chain | None = None
 
     @cached_property
     def bound(self) -> float:
@@ -212,7 +215,6 @@ class BorderEdge:
 
     start: RoadmapPlace
     curve: Curve
-    gained: Contact | None  # at its end; None at an obstacle
     terms: Terms
 
     def __getstate__(self) -> dict[str, Any]:
@@ -223,6 +225,17 @@ class BorderEdge:
     def stop(self) -> RoadmapPlace:
         """The place at its end."""
         return make_place(self.formation.scene, self.curve.end)
+
+    @cached_property
+    def gained(self) -> Contact | None:
+        """The contact that is gained at its end; None at an obstacle."""
+        formation = self.formation
+        values = np.abs(formation.evaluate_limits(np.array([self.curve.start, self.curve.end])))
+        met = values[1] < formation.scene.touching
+        # A contact that is closed at the start, such as the end of a flush edge, is not gained.
+        opened = values[0] > HELD * formation.scene.scales.length
+        rows = [*np.flatnonzero(met & opened), *np.flatnonzero(met)]
+        return next(filter(None, (formation.limits[k].gained for k in rows)), None)
 
     @cached_property
     def limits(self) -> BorderLimits:
@@ -251,7 +264,7 @@ def follow_borders(
             break
     else:
         curves = _trace(formation, place.z, known)
-    return [BorderEdge(place, curve, _find_gained(curve), terms) for curve in curves]
+    return [BorderEdge(place, curve, terms) for curve in curves]
 
 
 def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
@@ -272,35 +285,11 @@ def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
     return curves
 
 
-def _find_gained(curve: Curve) -> Contact | None:
-    """The contact that is gained at the end of a curve."""
-    formation = curve.formation
-    values = np.abs(formation.evaluate_limits(np.array([curve.start, curve.end])))
-    met = values[1] < formation.scene.touching
-    # A contact that is closed at the start, such as the end of a flush edge, is not gained.
-    opened = values[0] > HELD * formation.scene.scales.length
-    for rows in (met & opened, met):
-        for k in np.flatnonzero(rows):
-            if formation.limits[k].gained is not None:
-                return formation.limits[k].gained
-    return None
-
-
 def point_out(contacts: Sequence[Contact], z: Array) -> Until:
     """The coordinate that changes along a border, as the end of a phase there."""
     if sum(contact.finger is None for contact in contacts) == 2:
         return Until(coordinate="x", value=float(z[0]))
     return Until(coordinate="phi", value=float(z[2]))
-
-
-def leave_at(edge: Edge, share: float | None) -> tuple[EdgeStep, ...]:
-    """The phases of an edge that leaves a border at a share of its length; with None in motion."""
-    first, *rest = edge.steps
-    if share is None:
-        return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
-    assert edge.left is not None
-    z = edge.left.evaluate(np.array([share * edge.left.length])).z[0]
-    return (first._replace(until=point_out(first.contacts, z)), *rest)
 
 
 def describe_steps(steps: Sequence[EdgeStep]) -> str:
@@ -331,6 +320,64 @@ def time_parts(border: BorderEdge, shares: Array) -> Array:
     motion = speed_sweep(limits.scale(lengths[:, None]), steps, part, sweeps=2)
     times[: len(lengths)] = motion.find_durations(steps)
     return times
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Borders that are followed to their ends in motion, and one after them."""
+
+    steps: tuple[EdgeStep, ...]  # phases along those that are followed whole
+    borders: tuple[BorderEdge, ...]  # these, and the last one
+    ratios: tuple[float, ...]  # speed ratios of all borders: the speed is continuous
+
+    def can_enter(self, formation: Formation) -> bool:
+        """Whether a formation keeps the gained contact and has no others that are new."""
+        last = self.borders[-1]
+        contacts, held = set(formation.contacts), set(last.formation.contacts)
+        return last.gained in contacts and contacts <= {*held, last.gained}
+
+    def extend(self, following: BorderEdge) -> Chain | None:
+        """The chain with another border entered in motion; None if impossible."""
+        last, gained = self.borders[-1], self.borders[-1].gained
+        if not self.can_enter(following.formation):
+            return None
+        (v,) = last.curve.interpolate(np.array([last.curve.length]))[1]
+        (heading,) = following.curve.interpolate(np.zeros(1))[1]
+        continues = v * metric_weights(last.formation.scene) @ heading > 1 - 2 * BEND
+        ends = (End.SMOOTH, End.IMPACT) if continues else (End.IMPACT,)
+        for end in ends:
+            phase = Phase(0, last.formation, Until(contact=gained), end)
+            join = compute_curve_impact(phase, last.curve, following.curve)
+            if join.possible and np.isfinite(join.ratio):
+                return Chain(
+                    (*self.steps, EdgeStep(last.formation.contacts, phase.until, end)),
+                    (*self.borders, following),
+                    (*self.ratios, self.ratios[-1] * join.ratio),
+                )
+        return None
+
+    @cached_property
+    def edge(self) -> Edge | Blocked | None:
+        """The edge along all of it; None where the last border ends at an obstacle."""
+        last = self.borders[-1]
+        if last.gained is None:
+            return None
+        edge = self._edge(Until(contact=last.gained), last)
+        return replace(edge, chain=self) if isinstance(edge, Edge) else edge
+
+    def end_at(self, goal: Goal) -> Edge | Blocked | None:
+        """The edge to a goal on the last border; None if there is none."""
+        last = self.borders[-1]
+        place = measure_along(last.curve, goal)
+        if place is None:
+            return None
+        curve = replace(last.curve, length=place[0], ending="", reached=True)
+        return self._edge(place[1], replace(last, curve=curve))
+
+    def _edge(self, until: Until, last: BorderEdge) -> Edge | Blocked:
+        """The edge to rest at the end of the last border, or of a part of it."""
+        steps = (*self.steps, EdgeStep(last.formation.contacts, until))
+        return edge_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
 
 
 def edge_along(

@@ -100,8 +100,7 @@ def find_route(
             raise InputError(problem.source, "goal", reason)
         if cache is not None:
             make_folder(str(cache), "cache")
-        key = describe_key(problem, plan_options)
-        roadmap = get_roadmap(problem, plan_options, key, cache)
+        key, roadmap = get_roadmap(problem, plan_options, cache)
         before, start, spent = list[Answer](), problem.start, 0.0
         for index, goal in enumerate(problem.goals):
             place = make_place(problem.scene, start)
@@ -129,23 +128,22 @@ def find_route(
         return before[-1]
 
 
-def describe_key(problem: Problem, options: PlanOptions) -> str:
-    """Everything that the roadmap of a problem depends on, as JSON."""
-    key = describe_scene(problem.scene) | {"": (problem.epsilon, options.uniqueness_margin)}
-    return json.dumps(key, sort_keys=True)
-
-
 def get_roadmap(
-    problem: Problem, options: PlanOptions, key: str, cache: str | Path | None
-) -> Roadmap:
-    """The roadmap of a problem's scene, from memory, from a folder, or a new one."""
+    problem: Problem, options: PlanOptions, cache: str | Path | None
+) -> tuple[str, Roadmap]:
+    """The roadmap of a problem's scene, from memory, from a folder, or a new one.
+
+    And everything that it depends on, as JSON.
+    """
+    numbers = problem.epsilon, options.uniqueness_margin
+    key = json.dumps(describe_scene(problem.scene) | {"": numbers}, sort_keys=True)
     roadmap = _roadmaps.pop(key, None)
     if roadmap is None and cache is not None:
         roadmap = load_roadmap(Path(cache), key)
     _roadmaps[key] = roadmap = roadmap or Roadmap(problem, options.uniqueness_margin)
     while len(_roadmaps) > ROADMAPS:
         _roadmaps.popitem(last=False)
-    return roadmap
+    return key, roadmap
 
 
 def forget_roadmaps() -> None:

@@ -10,8 +10,8 @@ all paths share one `LimitSet`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -24,43 +24,28 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.path_guess import is_inside
 from ..mapping.borders import NOWHERE, label_cells
-from ..mechanics.dynamics import (
-    ONE,
-    Directions,
-    close_contacts,
-    force_rows,
-    inverse,
-    metric_weights,
-)
+from ..mechanics.dynamics import ONE, Directions, close_contacts, force_rows, inverse
 from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
-from ..planning.blocks import BEND, compute_curve_impact
 from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
-from ..problem.definition import End, Goal, Phase, Problem, Until
+from ..problem.definition import End, Goal, Problem, Until
 from ..scene.model import Scene
 from .edge_plans import CoarsePlan, Lost, PartPlan
 from .edges import (
     Blocked,
     BorderEdge,
+    Chain,
     Edge,
     EdgeStep,
     Terms,
     Unstopped,
-    edge_along,
     follow_borders,
     point_out,
     time_parts,
 )
-from .places import (
-    RoadmapPlace,
-    close_place,
-    is_flush,
-    list_formations_at,
-    make_place,
-    measure_along,
-)
+from .places import RoadmapPlace, close_place, is_flush, list_formations_at, make_place
 
 T = TypeVar("T")
 
@@ -183,28 +168,21 @@ class Roadmap:
         )
         return [longer for longer in chains if longer]
 
-    def set_out(
-        self, place: RoadmapPlace, goal: Goal
-    ) -> Iterator[tuple[Edge | Blocked, Chain | None]]:
-        """Edges along borders from a place, with the chains that may go on from where they end.
-
-        They follow several borders only where a motion cannot stop.
-        """
+    def set_out(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge | Blocked]:
+        """Edges along borders from a place, along several only where a motion cannot stop."""
         for chain in self.follow(place):
             yield from self._list_ends(chain, goal)
 
-    def go_on(self, chain: Chain, goal: Goal) -> Iterator[tuple[Edge, Chain | None]]:
+    def go_on(self, chain: Chain, goal: Goal) -> Iterator[Edge]:
         """Feasible edges that pass the end of a chain in motion; further ones as in `set_out`."""
         for longer in self.extend(chain):
-            for edge, ahead in self._list_ends(longer, goal):
-                if isinstance(edge, Edge):
-                    yield edge, ahead
+            yield from (e for e in self._list_ends(longer, goal) if isinstance(e, Edge))
 
-    def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
+    def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Edge | Blocked]:
         if chain.edge is not None:
-            yield chain.edge, chain
+            yield chain.edge
         if (ending := self._once(partial(chain.end_at, goal), chain.borders, goal)) is not None:
-            yield ending, None
+            yield ending
         if isinstance(chain.edge, Blocked) and isinstance(chain.edge.reason, Unstopped):
             yield from self.go_on(chain, goal)
 
@@ -212,11 +190,11 @@ class Roadmap:
         """All feasible edges along borders from a place to their ends or to a goal."""
         waiting = list(self.set_out(place, goal))
         while waiting:
-            edge, chain = waiting.pop()
+            edge = waiting.pop()
             if isinstance(edge, Edge):
                 yield edge
-                if chain:
-                    waiting += self.go_on(chain, goal)
+                if edge.chain:
+                    waiting += self.go_on(edge.chain, goal)
 
     def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
         """Edges from rest at a place through the cells around it, and to a goal inside of them."""
@@ -229,31 +207,30 @@ class Roadmap:
 
         Those of all borders `among` are computed together, which takes less time.
         """
-        if border not in self._releases:
-            self._release([other for other in among if other not in self._releases])
-        return self._releases[border]
-
-    def _release(self, borders: Sequence[BorderEdge]) -> None:
+        if border in self._releases:
+            return self._releases[border]
+        borders = [other for other in among if other not in self._releases]
         sources = dict[RoadmapPlace, tuple[BorderEdge, float, float]]()
-        for border in borders:
-            times = time_parts(border, RELEASES)
+        for each in borders:
+            times = time_parts(each, RELEASES)
             free = np.isfinite(times)
             if free.any():
-                z = border.curve.evaluate(RELEASES[free] * border.curve.length).z
+                z = each.curve.evaluate(RELEASES[free] * each.curve.length).z
                 middle = make_place(self.scene, z[0])
                 for row, share, time in zip(z, RELEASES[free], times[free], strict=True):
-                    sources[replace(middle, z=row)] = border, float(share), float(time)
+                    sources[replace(middle, z=row)] = each, float(share), float(time)
         best = dict[tuple[BorderEdge, tuple[Contact, ...]], Edge]()
         for edge in cross(list(sources), self.epsilon) if sources else ():
-            border, share, time = sources[edge.start]
-            key, duration = (border, edge.stop.contacts), time + edge.estimate
+            left, share, time = sources[edge.start]
+            key, duration = (left, edge.stop.contacts), time + edge.estimate
             if key not in best or duration < TIED * best[key].estimate:
-                held = border.formation.contacts
+                held = left.formation.contacts
                 steps = EdgeStep(held, point_out(held, edge.start.z)), *edge.steps
-                whole = replace(edge, start=border.start, steps=steps, estimate=duration)
-                best[key] = replace(whole, left=border.curve, share=share)
-        for border in borders:
-            self._releases[border] = [edge for (left, _), edge in best.items() if left is border]
+                whole = replace(edge, start=left.start, steps=steps, estimate=duration)
+                best[key] = replace(whole, left=left.curve, share=share)
+        for each in borders:
+            self._releases[each] = [edge for (left, _), edge in best.items() if left is each]
+        return self._releases[border]
 
     def land_at(self, edges: Sequence[Edge], goal: Goal) -> list[Edge]:
         """Copies of edges that land on the edge of a goal with x, moved to land at this x.
@@ -281,22 +258,56 @@ class Roadmap:
         return replace(edge, stop=replace(edge.stop, z=z), steps=(*first, step), left=None)
 
     def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
-        """Straight edges from a place to a goal inside a cell around it; x is sampled if free."""
+        """The fastest straight edge through each cell around a place to a goal inside of it.
+
+        If x is free it is sampled.
+        """
         if goal.phi is None:
             return []
-        x = place.z[0] + np.linspace(-1.5, 1.5, 13) * self.scene.scales.length
+        scene, table, edges = self.scene, contact_table(self.scene), list[Edge]()
+        x = place.z[0] + np.linspace(-1.5, 1.5, 13) * scene.scales.length
         x = x if goal.x is None else np.array([goal.x])
         poses = np.column_stack([x, np.full(len(x), goal.phi)])
         pins = () if goal.x is None else (("x", goal.x),)
-        until, formations = Until(None, "phi", goal.phi, pins), list_formations_at(place, 3)
-        edges = (go_to(place, each, poses, until, self.epsilon) for each in formations)
-        return [edge for edge in edges if edge]
+        until = Until(None, "phi", goal.phi, pins)
+        begin = np.broadcast_to(place.z[[0, 2]], poses.shape)
+        middles = begin[:, None] + MIDDLES[:, None] * (poses - begin)[:, None]
+        passed = np.concatenate([middles, poses[:, None]], axis=1)
+        seen = label_cells(scene, *passed.reshape(-1, 2).T)[:, [0, 2, 4]]
+        seen = seen.reshape(*passed.shape[:2], 3)
+        far = np.abs((poses - begin) / [scene.scales.length, 1.0]).max(axis=1) > NEAREST
+        for formation in list_formations_at(place, 3):
+            label = np.array([table.index(contact) for contact in formation.contacts])
+            inside = far & (seen == label).all(axis=(1, 2))
+            labels = np.tile(label, (int(inside.sum()), 1))
+            times = time_paths(scene, self.epsilon, labels, begin[inside], poses[inside])
+            if np.isfinite(times).any():
+                k = int(times.argmin())
+                (z,) = place_at(scene, labels[:1], poses[inside][k : k + 1])
+                stop = RoadmapPlace(scene, z, formation.contacts, landed=True)
+                step = EdgeStep(formation.contacts, until)
+                edges.append(Edge(place, stop, (step,), float(times[k]), True))
+        return edges
 
 
 def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
     """The fastest straight path through each cell to each contact, from places of one scene."""
     scene = places[0].scene
-    rays = shoot(places, epsilon)
+    cells, held = _list_cells(places)
+    angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
+    headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
+    sources = np.repeat(np.arange(len(places)), HEADINGS)
+    starts = np.array([place.z[[0, 2]] for place in places])[sources]
+    runs = np.tile(headings, (len(places), 1))
+    labels = label_cells(scene, *(starts + FIRST * runs).T)[:, [0, 2, 4]]
+    kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
+    rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
+    if len(rays.sources):
+        limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
+        rays = rays.pick(limits.can_rest())
+    s, after = _find_exits(scene, rays)
+    rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
+    rays = _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
     times = time_paths(scene, epsilon, rays.labels, rays.starts, rays.ends)
     best: dict[tuple[int, ...], int] = {}
     for k in np.flatnonzero(np.isfinite(times)).tolist():
@@ -312,31 +323,6 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
         stop = RoadmapPlace(scene, end, (*contacts, gained), landed=True)
         edges.append(Edge(start, stop, (step,), float(times[k]), True))
     return edges
-
-
-def go_to(
-    start: RoadmapPlace, formation: Formation, poses: Array, until: Until, epsilon: float
-) -> Edge | None:
-    """The fastest straight edge from a place to one of some poses (x, phi) inside a cell."""
-    scene = start.scene
-    label = np.array([contact_table(scene).index(contact) for contact in formation.contacts])
-    begin = np.broadcast_to(start.z[[0, 2]], poses.shape)
-    middles = begin[:, None] + MIDDLES[:, None] * (poses - begin)[:, None]
-    places = np.concatenate([middles, poses[:, None]], axis=1)
-    labels = label_cells(scene, *places.reshape(-1, 2).T)[:, [0, 2, 4]]
-    inside = (labels == label).all(axis=1).reshape(places.shape[:2]).all(axis=1)
-    inside &= np.abs((poses - begin) / [scene.scales.length, 1.0]).max(axis=1) > NEAREST
-    if not inside.any():
-        return None
-    ends = poses[inside]
-    labels = np.broadcast_to(label, (len(ends), 3))
-    times = time_paths(scene, epsilon, labels, begin[inside], ends)
-    k = int(times.argmin())
-    if not np.isfinite(times[k]):
-        return None
-    (z,) = place_at(scene, labels[:1], ends[k : k + 1])
-    stop = RoadmapPlace(scene, z, formation.contacts, landed=True)
-    return Edge(start, stop, (EdgeStep(formation.contacts, until),), float(times[k]), True)
 
 
 class Rays(NamedTuple):
@@ -357,26 +343,6 @@ class Rays(NamedTuple):
     def runs(self) -> Array:
         """From starts to ends, shape (n, 2)."""
         return self.ends - self.starts
-
-
-def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
-    """Rays from places of one scene, along which a motion can start, to the contact they gain."""
-    scene = places[0].scene
-    cells, held = _list_cells(places)
-    angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
-    headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
-    sources = np.repeat(np.arange(len(places)), HEADINGS)
-    starts = np.array([place.z[[0, 2]] for place in places])[sources]
-    runs = np.tile(headings, (len(places), 1))
-    labels = label_cells(scene, *(starts + FIRST * runs).T)[:, [0, 2, 4]]
-    kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
-    rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
-    if len(rays.sources):
-        limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
-        rays = rays.pick(limits.can_rest())
-    s, after = _find_exits(scene, rays)
-    rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
-    return _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
 
 
 def _find_exits(scene: Scene, rays: Rays) -> tuple[Array, Numbers]:
@@ -444,62 +410,3 @@ def _list_renamed(scene: Scene) -> Flags:
 
     table = contact_table(scene)
     return np.array([[is_renamed(one, two) for two in table] for one in table])
-
-
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """Borders that are followed to their ends in motion, and one after them."""
-
-    steps: tuple[EdgeStep, ...]  # phases along those that are followed whole
-    borders: tuple[BorderEdge, ...]  # these, and the last one
-    ratios: tuple[float, ...]  # speed ratios of all borders: the speed is continuous
-
-    def can_enter(self, formation: Formation) -> bool:
-        """Whether a formation keeps the gained contact and has no others that are new."""
-        last = self.borders[-1]
-        contacts, held = set(formation.contacts), set(last.formation.contacts)
-        return last.gained in contacts and contacts <= {*held, last.gained}
-
-    def extend(self, following: BorderEdge) -> Chain | None:
-        """The chain with another border entered in motion; None if impossible."""
-        last, gained = self.borders[-1], self.borders[-1].gained
-        if not self.can_enter(following.formation):
-            return None
-        (v,) = last.curve.interpolate(np.array([last.curve.length]))[1]
-        (heading,) = following.curve.interpolate(np.zeros(1))[1]
-        continues = v * metric_weights(last.formation.scene) @ heading > 1 - 2 * BEND
-        ends = (End.SMOOTH, End.IMPACT) if continues else (End.IMPACT,)
-        for end in ends:
-            phase = Phase(0, last.formation, Until(contact=gained), end)
-            join = compute_curve_impact(phase, last.curve, following.curve)
-            if join.possible and np.isfinite(join.ratio):
-                return Chain(
-                    (*self.steps, EdgeStep(last.formation.contacts, phase.until, end)),
-                    (*self.borders, following),
-                    (*self.ratios, self.ratios[-1] * join.ratio),
-                )
-        return None
-
-    @cached_property
-    def edge(self) -> Edge | Blocked | None:
-        """The edge along all of it; None where the last border ends at an obstacle."""
-        last = self.borders[-1]
-        return None if last.gained is None else self._edge(Until(contact=last.gained), last)
-
-    def end_at(self, goal: Goal) -> Edge | Blocked | None:
-        """The edge to a goal on the last border; None if there is none."""
-        last = self.borders[-1]
-        place = measure_along(last.curve, goal)
-        if place is None:
-            return None
-        curve = replace(last.curve, length=place[0], ending="", reached=True)
-        return self._edge(place[1], replace(last, curve=curve))
-
-    def _edge(self, until: Until, last: BorderEdge) -> Edge | Blocked:
-        """The edge to rest at the end of the last border, or of a part of it."""
-        steps = (*self.steps, EdgeStep(last.formation.contacts, until))
-        return edge_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
-
-
-Ahead = tuple[Edge | Blocked, Chain | None]
-"""An edge along borders, and the chain that may go on where it ends; None at a goal."""
