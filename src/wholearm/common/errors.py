@@ -82,6 +82,7 @@ class WholearmError(Exception):
     """Base of every error that this package raises on purpose."""
 
     exit_status = 1  # of the command line: 1 if the task cannot be done, 2 if the input is bad
+    phases: Sequence[int] = ()  # numbers of those that have no plan together, where that is known
 
 
 class InputError(WholearmError):

@@ -161,22 +161,28 @@ def plan_next(
     rounding = 1e-9 * problem.scene.scales.length
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.coarse:
-        numbers = "-".join(str(phase.number) for phase in phases)
-        report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
+        numbers = [phase.number for phase in phases]
+        report(
+            f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}: {options.goal.value}"
+        )
         with name_source(problem.source):
             more = planning.more.get(len(planning.blocks), 0.0)
             pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
-            made = plan_block(
-                replace(planning, problem=pressed),
-                phases,
-                z,
-                options,
-                to_go=look_ahead(planning, phases, options) if planning.ahead else None,
-                ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
-                fastest=[least[phase.index] for phase in phases if least],
-                begun=known.plans if known and known.coarse else (),
-                only_begin=coarse,
-            )
+            try:
+                made = plan_block(
+                    replace(planning, problem=pressed),
+                    phases,
+                    z,
+                    options,
+                    to_go=look_ahead(planning, phases, options) if planning.ahead else None,
+                    ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
+                    fastest=[least[phase.index] for phase in phases if least],
+                    begun=known.plans if known and known.coarse else (),
+                    only_begin=coarse,
+                )
+            except WholearmError as error:
+                error.phases = numbers
+                raise
         known = BlockPlan(phases, z, *made, coarse)
     return replace(planning, blocks=(*planning.blocks, known))
 

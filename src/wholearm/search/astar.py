@@ -369,7 +369,21 @@ class RoutePlanner:
                 best = plan
             if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
                 break
+            if isinstance(plan, Lost) and plan.phases and alike:
+                # Without its guess a phase was tried, too. Case: query 62, four of whose routes go
+                # through phases 18 and 19 of the first one.
+                plan.edges = self._find_lost(route, [k - len(before) for k in plan.phases])
+                break
         return best
+
+    def _find_lost(self, route: Route, phases: Sequence[int]) -> tuple[Edge, ...]:
+        """Edges that phases of a route belong to, after the one that lands at their start."""
+        coarse, owners = self.roadmap.coarse_plans, list[int]()
+        for k, edge in enumerate(route.edges):
+            owners += [k] * len((coarse[edge][0] if edge.in_cell else edge).steps)
+        first, last = owners[phases[0] - 1], owners[phases[-1] - 1]
+        first -= first > 0 and route.edges[first - 1].in_cell
+        return route.edges[first : last + 1]
 
     def _plan_parts(
         self, route: Route, problem: Problem, options: PlanOptions, report: Callable[[str], None]

@@ -141,6 +141,7 @@ class Lost(str):
 
     # the one whose planning fails, after the one that lands at its start, if any
     edges: tuple[Edge, ...] = ()
+    phases: Sequence[int] = ()  # numbers of the phases that have no plan, where that is known
 
 
 def plan_phases(
@@ -157,7 +158,8 @@ def plan_phases(
             with unadvised():
                 cache[key] = solve_with(problem, options, report)
         except WholearmError as error:
-            cache[key] = str(error)
+            cache[key] = lost = Lost(error)
+            lost.phases = error.phases
         except np.linalg.LinAlgError:
             cache[key] = DEPENDENT
     return cache[key]
