@@ -744,7 +744,7 @@ def point_kernel(formation: Formation, controls: int, homotopy: bool = False) ->
     if homotopy:
         Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
-        gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
+        gaps[n_c:] -= formation.build_constraints(s.first, s.v)[0][n_c:]
     push = build_force_rows(formation, P, A_t, Xi).T @ s.forces
     at_joints = ca.reshape(s.tau, 2, controls) @ p.shares - ca.DM(scene.dry[3:]) * sigma
     applied = push + ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, at_joints)
@@ -766,7 +766,8 @@ def end_kernel(formation: Formation) -> Kernel:
     x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
     gaps, P, _, _ = formation.build_constraints(x.z, x.v)
     if formation.rolling:
-        gaps[formation.n_contacts :] -= formation.roll_function(x.first, x.v)[0]
+        n_c = formation.n_contacts
+        gaps[n_c:] -= formation.build_constraints(x.first, x.v)[0][n_c:]
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
