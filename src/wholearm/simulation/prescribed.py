@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, NoReturn, cast
 import casadi as ca
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_lowest
 from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
 from ..contacts.elemental import build_features, build_pair
@@ -461,30 +461,16 @@ class Replay(Run):
         dips = inside.min(axis=0) < least - 1e-7
         if not dips.any():
             return [], math.inf
-        samples: dict[float, tuple[Record, Array, bool]] = {}
-
-        def look(x: float) -> None:
-            if 0 < x < 1 and x not in samples:
-                self.step_to(x * h)
-                record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
-                samples[x] = record, self.values, bool((self.values + self.slack < 0).any())
-                self.least = np.minimum(self.least, self.values[force])
-
-        for row in np.flatnonzero(dips).tolist():
-            middle = min(max(int(inside[:, row].argmin()), 1), len(_PLACES) - 2)
-            around = _PLACES[middle - 1 : middle + 2].tolist()
-            for x in around:
-                look(x)
-            ends = {0.0: stage_margins[0], 1.0: stage_margins[-1]}
-            values = [(samples[x][1] if x in samples else ends[x])[row] for x in around]
-            fall, rise = np.diff(values) / np.diff(around)
-            if rise > fall:
-                span = (around[2] - around[0]) / (rise - fall)
-                look(float(around[0] + around[1] - fall * span) / 2)
+        lowest = {find_lowest(_PLACES, inside[:, row])[1] for row in np.flatnonzero(dips)}
+        records, shown = list[Record](), math.inf
+        for x in sorted(lowest):
+            self.step_to(x * h)
+            records.append(Record.of(s, self.t + x * h, self.phase_index, self.impact))
+            self.least = np.minimum(self.least, self.values[force])
+            if (self.values + self.slack < 0).any():
+                shown = min(shown, x * h)
         self.step_to(h)
-        states = [samples[x] for x in sorted(samples)]
-        shown = [x for x in sorted(samples) if samples[x][2]]
-        return [record for record, _, _ in states], shown[0] * h if shown else math.inf
+        return records, shown
 
     def _is_at_end(self, t: float) -> bool:
         """Whether the step just tried ends the phase, at a torque break and but for rounding.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_lowest
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
@@ -376,30 +376,6 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
             text = f"{limit.text} is exceeded by {amounts[worst]:.3g} {limit.unit}"
             texts.append(f"{text} at t = {t[worst]:.5g} s, phase {phase.number}")
     return texts
-
-
-def find_lowest(t: Array, values: Array, shortest: float = 0.0) -> tuple[float, float]:
-    """Least value of a smooth function and where, refined by parabolas through three samples.
-
-    Times t, (n,) [s], never decrease. Parabolas are spoiled by rounding in intervals below
-    `shortest`.
-    """
-    first = int(values.argmin())
-    least, time = float(values[first]), float(t[first])
-    left, right = np.diff(t)[:-1], np.diff(t)[1:]
-    smooth = (left > shortest) & (right > shortest)
-    smooth &= (values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])
-    left, right, middle = left[smooth], right[smooth], t[1:-1][smooth]
-    fall = (values[1:-1] - values[:-2])[smooth] / left
-    rise = (values[2:] - values[1:-1])[smooth] / right
-    slope = (fall * right + rise * left) / (left + right)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.nan_to_num(-slope * (left + right) / (2 * (rise - fall)))
-    lowest = values[1:-1][smooth] + slope * shift / 2
-    if len(lowest) and lowest.min() < least:
-        k = int(lowest.argmin())
-        least, time = float(lowest[k]), float(middle[k] + shift[k])
-    return least, time
 
 
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
