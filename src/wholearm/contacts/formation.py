@@ -116,7 +116,7 @@ class Formation:
 
     @property
     def function(self) -> Expression:
-        """CasADi function (z, v) -> (gaps, then slip coordinates of what rolls [m]; A; A_t; P' v)."""
+        """CasADi function (z, v) -> (gaps and slips of what rolls [m], A, A_t, P' v)."""
         return _FUNCTIONS(self).function
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
