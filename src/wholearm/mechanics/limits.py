@@ -105,9 +105,9 @@ class LimitSet:
         first, second = map(LimitSet, parts)
         return first, second
 
-    def weigh(self, parameter: Parameter) -> Array:
+    def weigh(self, key: str) -> Array:
         """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
-        weights = [(limit.parameter.key == parameter.key) * limit.weight for limit in self.limits]
+        weights = [(limit.parameter.key == key) * limit.weight for limit in self.limits]
         return np.concatenate(weights)
 
     @cached_property

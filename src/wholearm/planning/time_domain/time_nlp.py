@@ -435,7 +435,7 @@ def add_limits(
     elif goal is Objective.ELASTIC:
         weights[limits.of(*{limit.kind for limit in limits.without(SPEED).limits})] = 1.0
     elif target.relaxation is not None:
-        weights = limits.weigh(target.relaxation)
+        weights = limits.weigh(target.relaxation.key)
 
     def give(added: Indices, row: int) -> None:
         """Add the slack of a limit's row, if it has one."""
