@@ -151,10 +151,11 @@ def _close_finger(
     obstacle = np.where(feature < 0, TOO_SHORT, 0)
     # Where the object is not above all of the joint it may overlap the link that hangs from there.
     low = np.flatnonzero(up.min(axis=0) <= link.radius)
-    hanging = np.full((len(low), 5), -np.pi / 2)
-    hanging[:, :3] = np.column_stack([x, y, phi])[low]
-    covered = measure_gaps(scene, hanging)[:, 1 + finger] < 1e-12 * link.length
-    obstacle[low[covered]] = JOINT_COVERED
+    if len(low):
+        hanging = np.full((len(low), 5), -np.pi / 2)
+        hanging[:, :3] = np.column_stack([x, y, phi])[low]
+        covered = measure_gaps(scene, hanging)[:, 1 + finger] < 1e-12 * link.length
+        obstacle[low[covered]] = JOINT_COVERED
     return angle, feature, obstacle
 
 

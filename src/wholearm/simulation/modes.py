@@ -47,7 +47,7 @@ from ..common.arrays import Array, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import close_all, move_least
+from ..mechanics.dynamics import close_all, find_freedoms, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
@@ -625,13 +625,12 @@ def find_opening(place: Standstill) -> Array | None:
     scene = place.formation.scene
     at = place.z[None], np.zeros((1, 5))
     normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
-    root = np.sqrt(scene.mass_diagonal)
-    P, along = place.formation.evaluate(*at).P[0] / root, normal / root
-    free = along - P.T @ np.linalg.lstsq(P.T, along, rcond=_SMALL)[0]
-    rate = float(free @ along)
-    if rate <= 3e-5 * float(along @ along):
+    N = find_freedoms(place.formation.evaluate(*at).P[0], scene.mass_diagonal, _SMALL)
+    push = N.T @ normal
+    rate = float(push @ push)
+    if rate <= 3e-5 * float(normal**2 @ (1 / scene.mass_diagonal)):
         return None
-    return np.asarray(free / root / rate)
+    return np.asarray(N @ push / rate)
 
 
 def _find_closing(
