@@ -23,7 +23,7 @@ from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
-from .elemental import Contact, GapLimit, build_features, build_once, build_pair, candidate_contacts
+from .elemental import Contact, GapLimit, build_features, candidate_contacts
 
 
 class Kinematics(NamedTuple):
@@ -176,7 +176,8 @@ _V = ca.SX.sym("v", 5)  # of all scenes, as z is
 
 def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     """Gap, rows A and A_t, A' v, slip coordinate [m] and A_t' v of a contact."""
-    pair, z = build_pair(contact, scene), build_features(scene).z
+    features = build_features(scene)
+    pair, z = features.pairs[contact], features.z
     A, A_t = (ca.jacobian(value, z) for value in (pair.gap, pair.slip))
     if contact.finger is not None and (contact.feature, contact.surface) == ("v", "tip"):
         # The slip is that at the arc, A_t that of the vertex, wherever it is.
@@ -186,7 +187,7 @@ def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
 
 
 def _build_function(formation: Formation) -> Batch:
-    parts = [build_once(_build_part, contact, formation.scene) for contact in formation.contacts]
+    parts = [_build_part(contact, formation.scene) for contact in formation.contacts]
     rolling = [parts[row] for row in formation.rolling_rows]
     rows = (
         (1, [part[0] for part in parts] + [part[4] for part in rolling]),

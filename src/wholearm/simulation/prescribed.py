@@ -37,7 +37,7 @@ import numpy as np
 from ..common.arrays import Array, find_lowest
 from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
-from ..contacts.elemental import build_features, build_pair
+from ..contacts.elemental import build_features
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
@@ -97,19 +97,19 @@ def _build_ends(formation: Formation, until: Until, side: float) -> PhaseEnds:
     scene = formation.scene
     gained = [limit.value for limit in formation.limits if limit.gains(until.contact)]
     limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
-    z, v = build_features(scene).z, ca.SX.sym("v", 5)
+    features, v = build_features(scene), ca.SX.sym("v", 5)
     if until.is_release:
         distance = ca.SX(1)
     elif until.contact is None:
         row, value = until.poses[0]
-        distance = side * (z[row] - value)
+        distance = side * (features.z[row] - value)
     elif gained:
         # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
         distance = ca.mmin(ca.vertcat(*gained))
     else:
-        distance = build_pair(until.contact, scene).gap
-    parts = *(limit.value for limit in limits), distance, ca.jtimes(distance, z, v)
-    function = ca.Function("ends", [ca.vertcat(z, v)], [ca.densify(ca.vertcat(*parts))])
+        distance = features.pairs[until.contact].gap
+    parts = *(limit.value for limit in limits), distance, ca.jtimes(distance, features.z, v)
+    function = ca.Function("ends", [ca.vertcat(features.z, v)], [ca.densify(ca.vertcat(*parts))])
     state, values = np.zeros(10), np.zeros(len(parts))
     evaluate, texts = bind(function, [state], values), [limit.text for limit in limits]
     unit = 1.0 if until.coordinate == "phi" else scene.scales.length

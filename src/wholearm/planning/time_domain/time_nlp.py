@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
 from ...contacts.contact_limits import build_limits, list_renamed
-from ...contacts.elemental import Contact, build_features, build_pair
+from ...contacts.elemental import Contact, build_features
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, find_vanishing, tangent_basis
 from ...mechanics.dynamics import build_force_rows
@@ -837,7 +837,7 @@ def goal_kernel(
     parts: list[Expression] = [ca.SX(0, 1)]
     if until is not None and until.contact is not None:
         # Where a contact changes its name its gap has no gradient, but the end of its range has.
-        gap = build_pair(until.contact, scene).gap
+        gap = build_features(scene).pairs[until.contact].gap
         parts.append(gap if row is None else formation.limits[row].value)
     if until is not None:
         parts += [z[row] - value for row, value in until.poses]
