@@ -766,21 +766,6 @@ class FreeRun(Run):
         root = math.sqrt(speed**2 + 2 * push * REACH)
         self.longest = float(2 * REACH / (speed + root + 1e-300))
 
-    def _sample(self, h: float) -> tuple[Array, Array, Array]:
-        """Instants of the step just made, of length h, both its ends too; gaps and ranges there."""
-        start, end = self.before, self.after
-        z, v, _ = np.abs(end.motion - start.motion)
-        travel = float(((z + h * v) / self.system.units[: self.system.n]).max())
-        count = 1 + int(LOOKS * min(1.0, travel / REACH))
-        times = h * np.arange(count + 1) / count
-        gaps, ranges = [start.gaps, end.gaps], [start.ranges, end.ranges]
-        if count > 1:
-            knots = tuple(np.stack([start.motion, end.motion], axis=1))
-            first = np.zeros(count - 1, dtype=np.int64)
-            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
-            gaps[1:1], ranges[1:1] = self.system.measure(z)
-        return times, np.array(gaps), np.array(ranges)
-
     def measure(self) -> Array:
         """Event values of the steps, then ranges of kept pairs."""
         out, to = self.s.outputs, self.s.to
@@ -869,8 +854,18 @@ class FreeRun(Run):
         self, h: float, passed: Sequence[int]
     ) -> tuple[int, float, float, float] | None:
         """The first pair whose gap falls below a level [m], that, and a bracket of when [s]."""
-        unit = self.unit
-        times, gaps, ranges = self._sample(h)
+        unit, start, end = self.unit, self.before, self.after
+        z, v, _ = np.abs(end.motion - start.motion)
+        travel = float(((z + h * v) / self.system.units[: self.system.n]).max())
+        count = 1 + int(LOOKS * min(1.0, travel / REACH))
+        times = h * np.arange(count + 1) / count
+        seen = [start.gaps, end.gaps], [start.ranges, end.ranges]
+        if count > 1:
+            knots = tuple(np.stack([start.motion, end.motion], axis=1))
+            first = np.zeros(count - 1, dtype=np.int64)
+            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
+            seen[0][1:1], seen[1][1:1] = self.system.measure(z)
+        gaps, ranges = map(np.array, seen)
         # What comes apart within the step may close again within it.
         apart = np.logical_or.accumulate(gaps[:-1] > ARMED * unit, axis=0)
         level = np.where(apart, 0.0, self.level)

@@ -380,11 +380,8 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
 
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
     """Commands that motors with some lags, shape (2,) [s], make torques of: tau + lag tau'."""
-    order = np.arange(1, torque.coefficients.shape[2])
-    slopes = np.zeros_like(torque.coefficients)
-    slopes[..., :-1] = torque.coefficients[..., 1:] * order
-    slopes *= (2 / np.diff(torque.breaks))[:, None, None]
-    return TorqueProfile(torque.breaks, torque.coefficients + lag[:, None] * slopes)
+    change = lag[:, None] * torque.slopes.coefficients
+    return TorqueProfile(torque.breaks, torque.coefficients + change)
 
 
 def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
@@ -393,8 +390,8 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     if not scene.has_slow_motors:
         return []
     x = np.linspace(-1, 1, 33)
-    values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
-    rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
+    rates = torque.slopes.at_places(x)
+    commands = torque.at_places(x) + scene.actuator_lag[:, None] * rates
     times = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * (1 + x) / 2
     misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
