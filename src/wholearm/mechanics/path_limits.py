@@ -65,12 +65,12 @@ class PathLimits(NamedTuple):
         rows[..., ONE] += amount
         return self._replace(rows=rows)
 
-    def eliminate(self) -> PathLimits:
-        """Limits without lambda: one for each pair of rows, ordered as `triu_indices(m, 1)`.
+    def eliminate(self, column: int = LAMBDA) -> PathLimits:
+        """Limits without lambda, or a: one for each pair of rows, ordered as `triu_indices(m, 1)`.
 
         Without any influence of lambda, as with three contacts, they are the rows themselves.
         """
-        by = self.rows[..., LAMBDA]
+        by = self.rows[..., column]
         if not by.any():
             return self._replace(rows=self.rows[..., :LAMBDA])
         i, j = np.triu_indices(by.shape[-1], 1)
@@ -136,15 +136,11 @@ class PathLimits(NamedTuple):
 
     def find_largest_b(self) -> Array:
         """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
-        of_a = self.rows[..., A]
-        up, down = np.maximum(of_a, 0)[:, :, None], np.maximum(-of_a, 0)[:, None, :]
-        one, b, v = (
-            down * self.rows[:, :, None, k] + up * self.rows[:, None, :, k] for k in (ONE, B, V)
-        )
+        rows = self.eliminate(A).rows
+        one, b, v = (rows[..., k] for k in (ONE, B, V))
         with np.errstate(divide="ignore", invalid="ignore"):
             root = (v + np.sqrt(np.maximum(v**2 - 4 * b * one, 0))) / (-2 * b)
-        bounded = (up > 0) & (down > 0) & (b < 0)
-        largest = np.where(bounded, np.maximum(root, 0), np.inf).min(axis=(1, 2))
+        largest = np.where(b < 0, np.maximum(root, 0), np.inf).min(axis=-1)
         return np.asarray(np.minimum(largest**2, self.cap))
 
 
