@@ -193,9 +193,12 @@ def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Number
         if radius > 0:
             arc = sweep(_find_angle(link, sign, ARC, x, y))
             swept.append(np.where(run > length, arc, np.inf))
-    all_swept = np.vstack(swept)
-    feature, least = all_swept.argmin(axis=0), all_swept.min(axis=0)
-    reached = np.isfinite(least)
+    all_swept = np.array(swept)
+    least = all_swept.min(axis=(0, 1))
+    touching, reached = all_swept == least, np.isfinite(least)
+    # Of an edge that lies flush, the vertex where it begins, whatever the numbers of both.
+    touching &= ~np.roll(touching, 1, axis=1)
+    feature = np.concatenate(touching).argmax(axis=0)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
 
