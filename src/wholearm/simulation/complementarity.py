@@ -779,10 +779,6 @@ class FreeRun(Run):
         """Values that start below zero may stay there: modes are judged a moment later."""
         return self.floor
 
-    def locate(self, h: float, t: float) -> list[int]:
-        """Shorten the step just made, of length `h` to `t`, to its first event, if there is one."""
-        return self.find_first(h)
-
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
