@@ -80,7 +80,7 @@ def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
     formation = plane.make_formation(scene, name)
     slip, z_symbol = (
-        elemental.build_pair(formation.contacts[0], scene).slip,
+        elemental.build_features(scene).pairs[formation.contacts[0]].slip,
         elemental.build_features(scene).z,
     )
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])

@@ -25,7 +25,7 @@ from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, close_fingers, contact_table, first_contact
 from wholearm.contacts.contact_limits import FINGERS_TOUCH, build_finger_gap, evaluate_finger_gap
 from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.geometry.curve import Curve, join, take
+from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_map import (
@@ -622,35 +622,3 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
         closed = gaps(problem.scene, edge.stop.contacts, edge.stop.z[None])
         assert np.abs(closed).max() < 1e-8 * problem.scene.scales.length
     assert chart.land_at(chart.release(border, borders), Goal(flush=1)) == []
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_parts_of_a_joined_curve_are_what_is_traced_from_there(
-    curves: tuple[Curve, ...], index: int
-) -> None:
-    """Joined of the two that are traced both ways from a place inside another one."""
-    curve = curves[index]
-    at = curve.evaluate(np.array([0.4 * curve.length]))
-    ways = -at.z_s[0], at.z_s[0]
-    whole = join(*(trace_curve(curve.formation, at.z[0], way, Until()) for way in ways))
-    length = whole.formation.scene.scales.length
-    for share in (0.0, 0.3, 0.7, 1.0):
-        s = share * whole.length
-        at = whole.evaluate(np.array([s]))
-        for stop, sign in ((whole.length, 1), (0.0, -1)):
-            if abs(stop - s) < 0.1 * whole.length:
-                continue
-            part = take(whole, s, stop)
-            traced = trace_curve(whole.formation, at.z[0], sign * at.z_s[0], Until())
-            # Panels are resolved to 1e-13, and ends are as sharp as limits are met, to 3e-10.
-            assert part.length == pytest.approx(traced.length, abs=1e-9 * length)
-            places = np.linspace(0, 1, 50) * min(part.length, traced.length)
-            own, other = part.evaluate(places), traced.evaluate(places)
-            np.testing.assert_allclose(own.z, other.z, atol=1e-11)
-            np.testing.assert_allclose(own.z_s, other.z_s, atol=1e-10)
-            np.testing.assert_allclose(part.start, at.z[0], atol=1e-12)
-            assert len(part.segments) == len(traced.segments)
-            for mine, theirs in zip(part.segments, traced.segments, strict=True):
-                assert mine.stop == pytest.approx(theirs.stop, abs=1e-8 * length)
-                np.testing.assert_array_equal(mine.Xi, theirs.Xi)
-                np.testing.assert_array_equal(mine.sigma, theirs.sigma)

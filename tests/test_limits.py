@@ -71,7 +71,7 @@ def test_a_parameter_moves_the_bounds_of_its_limits_by_their_weight(formation: F
             scene = replace(formation.scene, fingers=(links[0], links[1]))
             other = make_limits(replace(formation, scene=scene), 0.1)
         rise = -signs * (other.sides[2] - bounds)
-        np.testing.assert_allclose(rise, 1e-3 * limits.weigh(parameter)[rows], atol=1e-13)
+        np.testing.assert_allclose(rise, 1e-3 * limits.weigh(parameter.key)[rows], atol=1e-13)
         assert rise.max() > 1e-4
 
 

@@ -31,7 +31,6 @@ or right above it, so that the link overlaps the object before it closes; the ot
 in its way."""
 SIDE, EDGE, ARC = 0, 1, 2
 """What of a link and an object touch: its side a vertex, its tip an edge, its tip a vertex."""
-AROUND = 3  # neighbouring vertices that are looked at where a finger closes
 CHUNK = 4096  # poses that are closed at a time, so that they stay in the cache
 
 
@@ -145,93 +144,30 @@ def _close_finger(
     scene: Scene, finger: int, x: Array, y: Array, phi: Array
 ) -> tuple[Array, Numbers, Numbers]:
     """Angle, first feature (sides, edges, arcs as in the candidates) and obstacle, at n poses."""
-    link, count = scene.fingers[finger], scene.polygon.n_vertices
-    joint = np.asarray(link.base)
-    angle, feature = np.empty(len(x)), np.empty(len(x), dtype=np.int64)
-    obstacle = np.zeros(len(x), dtype=np.int64)
-    first, clear = find_nearby(scene, finger, x, y, phi)
-    for mine, size in ((clear, min(AROUND, count)), (~clear, count)):
-        if not mine.any():
-            continue
-        vertices = (first[mine] + np.arange(size + 1)[:, None]) % count
-        across, up = place_corners(scene, x[mine], y[mine], phi[mine], vertices)
-        across, up = across - joint[0], up - joint[1]
-        least, touching = _touch(link, finger, across, up)
-        reached = touching >= 0
-        kind, place = np.divmod(touching, size)
-        numbers = kind * count + vertices[place, np.arange(len(place))]
-        feature[mine], angle[mine] = np.where(reached, numbers, -1), least
-        obstacle[mine] = np.where(reached, 0, TOO_SHORT)
-        if mine is not clear:
-            hanging = np.full((len(least), 5), -np.pi / 2)
-            hanging[:, :3] = np.column_stack([x, y, phi])[mine]
-            covered = measure_gaps(scene, hanging)[:, 1 + finger] < 1e-12 * link.length
-            obstacle[mine] = np.where(covered, JOINT_COVERED, obstacle[mine])
+    link = scene.fingers[finger]
+    corners = place_corners(scene, x, y, phi, np.arange(scene.polygon.n_vertices)[:, None])
+    across, up = (part - base for part, base in zip(corners, np.asarray(link.base), strict=True))
+    angle, feature = _touch(link, finger, across, up)
+    obstacle = np.where(feature < 0, TOO_SHORT, 0)
+    # Where the object is not above all of the joint it may overlap the link that hangs from there.
+    low = np.flatnonzero(up.min(axis=0) <= link.radius)
+    if len(low):
+        hanging = np.full((len(low), 5), -np.pi / 2)
+        hanging[:, :3] = np.column_stack([x, y, phi])[low]
+        covered = measure_gaps(scene, hanging)[:, 1 + finger] < 1e-12 * link.length
+        obstacle[low[covered]] = JOINT_COVERED
     return angle, feature, obstacle
-
-
-def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tuple[Numbers, Flags]:
-    """Vertices that a closing finger may touch first, for n poses.
-
-    The edges whose outer side faces the joint are a chain. A long link touches the vertex at its
-    end; a short one touches with its tip, where distances from the joint first fall to its length.
-    Returns the first of `AROUND` neighbouring vertices, (n,), and whether this holds, (n,): the
-    joint is outside of the object and not above any of it.
-    """
-    link, body = scene.fingers[finger], scene.polygon.vertices
-    count, radius = len(body), link.radius
-    size, along, outward, starts, offsets = _list_edges(scene)
-    before, after = (np.arange(count) - 1) % count, (np.arange(count) + 1) % count
-    c, s = np.cos(phi), np.sin(phi)
-    across, up = np.asarray(link.base)
-    dx, dy = across - x, up - y
-    joint = np.column_stack([c * dx + s * dy, c * dy - s * dx])
-    height = joint @ outward.T - offsets
-    seen = height > radius
-    lowest = (np.column_stack([s, c]) @ body.T).min(axis=1) - dy
-    clear = seen.any(axis=1) & (lowest > -1e-12 * link.length) & (link.length > radius)
-    # Finger 1 comes to the end of the chain, finger 2 to its start.
-    onwards = after if finger == 0 else before
-    vertex = ((seen & ~seen[:, onwards]).argmax(axis=1) + (finger == 0)) % count
-    away = np.hypot(*(joint - body[vertex]).T)
-    far = np.flatnonzero(clear & (away**2 - radius**2 > link.length**2))
-    if len(far):
-        away = np.hypot(*(joint[far, None] - body).transpose(2, 0, 1))
-        place = joint[far] @ along.T - starts
-        height, least = height[far], away - radius
-        # From the ends of an edge, moved out by the radius, and from the edge between them.
-        start = away**2 + radius**2 - 2 * radius * height
-        stop = away[:, after] ** 2 + radius**2 - 2 * radius * height
-        within = np.minimum(start, stop) <= link.length**2
-        within |= (place > 0) & (place < size) & (height - radius <= link.length)
-        corner = (place <= 0) & (place >= size)[:, before]
-        corner &= least <= link.length
-        within = seen[far] & (within | corner | corner[:, after])
-        vertex[far] = (within & ~within[:, onwards]).argmax(axis=1) + (finger == 0)
-    return (vertex - AROUND // 2) % count, clear
-
-
-@lru_cache(maxsize=8)
-def _list_edges(scene: Scene) -> tuple[Array, Array, Array, Array, Array]:
-    """Lengths of edges, directions, outward normals, and products of both with where they begin."""
-    body = scene.polygon.vertices
-    run = np.roll(body, -1, axis=0) - body
-    size = np.hypot(run[:, 0], run[:, 1])
-    along = run / size[:, None]
-    outward = np.column_stack([along[:, 1], -along[:, 0]])
-    return size, along, outward, (along * body).sum(axis=1), (outward * body).sum(axis=1)
 
 
 def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Numbers]:
     """Angle of first contact of a closing finger, (n,), and feature of m sides, edges, arcs, or -1.
 
-    Vertices `x`, `y`, (m + 1, n), are relative to the joint; the last is only the end of an edge.
+    Vertices `x`, `y`, (m, n), are relative to the joint.
     """
     sign = 1.0 if finger == 0 else -1.0
     outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
     length, radius = link.length, link.radius
-    along_x, along_y = x[1:] - x[:-1], y[1:] - y[:-1]
-    x, y = x[:-1], y[:-1]
+    along_x, along_y = (np.roll(part, -1, axis=0) - part for part in (x, y))
     size = np.hypot(along_x, along_y)
     along_x, along_y = along_x / size, along_y / size
 
@@ -257,9 +193,12 @@ def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Number
         if radius > 0:
             arc = sweep(_find_angle(link, sign, ARC, x, y))
             swept.append(np.where(run > length, arc, np.inf))
-    all_swept = np.vstack(swept)
-    feature, least = all_swept.argmin(axis=0), all_swept.min(axis=0)
-    reached = np.isfinite(least)
+    all_swept = np.array(swept)
+    least = all_swept.min(axis=(0, 1))
+    touching, reached = all_swept == least, np.isfinite(least)
+    # Of an edge that lies flush, the vertex where it begins, whatever the numbers of both.
+    touching &= ~np.roll(touching, 1, axis=1)
+    feature = np.concatenate(touching).argmax(axis=0)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
 
@@ -339,7 +278,10 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
-    body, normals = scene.polygon.vertices, _list_edges(scene)[2]
+    body = scene.polygon.vertices
+    run = np.roll(body, -1, axis=0) - body
+    along = run / np.hypot(run[:, 0], run[:, 1])[:, None]
+    normals = np.column_stack([along[:, 1], -along[:, 0]])
     z[:, 1] = -_turn(body[labels[:, 0]], poses[:, 1])[:, 1]
     for finger, link in enumerate(scene.fingers):
         sign = 1.0 if finger == 0 else -1.0

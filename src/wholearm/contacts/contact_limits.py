@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import accumulate
+from itertools import accumulate, product
 
 import casadi as ca
 
 from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Store
 from ..scene.model import Scene
-from .elemental import Contact, GapLimit, build_features, build_once, candidate_contacts
+from .elemental import Contact, GapLimit, build_features, candidate_contacts
 
 FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
 ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
@@ -55,22 +55,21 @@ def build_finger_gap(scene: Scene) -> Expression:
     return separate(first, second, size) - thickness
 
 
-def _build_finger_gaps(scene: Scene) -> Batch:
-    function = ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)])
-    return Batch(function)
-
-
-_FINGER_GAPS = Store(_build_finger_gaps, lambda scene: scene.shape)
-
-
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
     """Signed distance of the links at configurations z (n, 5), shape (n,) [m]."""
     return _FINGER_GAPS(scene)(z)[0][:, 0, 0]
 
 
+def _build_finger_gaps(scene: Scene) -> Batch:
+    return Batch(ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)]))
+
+
+_FINGER_GAPS = Store(_build_finger_gaps, lambda scene: scene.shape)
+
+
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
-    limits = [limit for c in contacts for limit in build_once(build_limits, c, scene)]
+    limits = [limit for c in contacts for limit in build_limits(c, scene)]
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
         limits += _list_clearances(scene, finger, held)
@@ -108,8 +107,7 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
             end = (contact.index + 1 - (finger or 0)) % count
             contacts += [Contact("v", end, "back", finger), replace(contact, surface="joint")]
     limits = [
-        build_once(build_clearance, c, scene, bool(held if c.surface == "joint" else on_side))
-        for c in contacts
+        build_clearance(c, scene, bool(held if c.surface == "joint" else on_side)) for c in contacts
     ]
     if finger is None or held:
         return limits
@@ -173,7 +171,7 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
 
 def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
     """Whether `contact` is the neighbour of one of `held` at the end of its range."""
-    limits = (limit for contact in held for limit in build_once(build_limits, contact, scene))
+    limits = (limit for contact in held for limit in build_limits(contact, scene))
     return any(limit.gained == contact for limit in limits)
 
 
@@ -204,19 +202,24 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     for inside in ranges:
         gap = ca.fmax(gap, -inside)
     if contact.feature == "e" and not touching:
-        others = build_once(_list_other_gaps, replace(contact, index=0), scene)
+        others = _OTHER_GAPS(scene)[contact.surface, contact.finger]
         gap = ca.fmax(gap, others[contact.index] - pair.gap)
     return GapLimit(gap, pair.text, gained)
 
 
-def _list_other_gaps(contact: Contact, scene: Scene) -> list[Expression]:
-    """For each edge the largest gap of all others with an end of a link, by running maxima."""
-    pairs, edges = build_features(scene).pairs, range(scene.polygon.n_vertices)
-    values = [pairs[replace(contact, index=edge)].gap for edge in edges]
-    before = list(accumulate(values[:-1], ca.fmax))
-    after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
-    inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
-    return [after[0], *inner, before[-1]]
+def _list_other_gaps(scene: Scene) -> dict[tuple[str, int], list[Expression]]:
+    """For each edge the largest gap of all others, by the end of which link; by running maxima."""
+    pairs, edges, others = build_features(scene).pairs, range(scene.polygon.n_vertices), {}
+    for end, finger in product(("tip", "joint"), (0, 1)):
+        values = [pairs[Contact("e", edge, end, finger)].gap for edge in edges]
+        before = list(accumulate(values[:-1], ca.fmax))
+        after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
+        inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
+        others[end, finger] = [after[0], *inner, before[-1]]
+    return others
+
+
+_OTHER_GAPS = Store(_list_other_gaps, lambda scene: scene.shape)
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:

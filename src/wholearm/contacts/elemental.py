@@ -28,9 +28,9 @@ The rows of Eq. (4), A = [W_n^T, -J_n] and A_t = [W_t^T, -J_t], are the gradient
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -218,22 +218,6 @@ def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -
                 text = f"{contact.corner} touches {contact.part}"
                 pairs[contact] = ContactPair(contact.name, gap, slip, tuple(ranges), text)
     return Features(z, vertices, tuple(parts), pairs)
-
-
-_BUILT: Store[dict[Any, Any]] = Store(lambda scene: {}, lambda scene: scene.shape)
-
-
-def build_once(build: Callable[..., Any], contact: Contact, scene: Scene, *options: bool) -> Any:
-    """What `build` makes of a contact: formations of scenes of one shape have it in common."""
-    key, built = (build, contact, *options), _BUILT(scene)
-    if key not in built:
-        built[key] = build(contact, scene, *options)
-    return built[key]
-
-
-def build_pair(contact: Contact, scene: Scene) -> ContactPair:
-    """Return `contact` as expressions of the features' symbol z."""
-    return build_features(scene).pairs[contact]
 
 
 def rotate_quarter(vector: Expression) -> Expression:

@@ -23,7 +23,7 @@ from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
-from .elemental import Contact, GapLimit, build_features, build_once, build_pair, candidate_contacts
+from .elemental import Contact, GapLimit, build_features, candidate_contacts
 
 
 class Kinematics(NamedTuple):
@@ -116,22 +116,14 @@ class Formation:
 
     @property
     def function(self) -> Expression:
-        """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
+        """CasADi function (z, v) -> (gaps and slips of what rolls [m], A, A_t, P' v)."""
         return _FUNCTIONS(self).function
-
-    @property
-    def roll_function(self) -> Expression:
-        """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
-        return _ROLL_FUNCTIONS(self).function
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
         """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
-        C, A, A_t, A_dot_v = self.function(z, v)
-        if not self.rolling:
-            return C, A, A_dot_v, A_t
-        slip, bend = self.roll_function(z, v)
-        P = ca.vertcat(A, A_t[list(self.rolling_rows), :])
-        return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
+        gaps, A, A_t, P_dot_v = self.function(z, v)
+        P = ca.vertcat(A, A_t[list(self.rolling_rows), :]) if self.rolling else A
+        return gaps, P, P_dot_v, A_t
 
     @property
     def limits(self) -> tuple[GapLimit, ...]:
@@ -140,18 +132,15 @@ class Formation:
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
-        C, A, A_t, P_dot_v = _FUNCTIONS(self)(z, v)
-        P = A
-        if self.rolling:
-            P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1)
-            P_dot_v = np.concatenate([P_dot_v, _ROLL_FUNCTIONS(self)(z, v)[1]], axis=1)
-        return Kinematics(C[..., 0], A, A_t, P, P_dot_v[..., 0])
+        gaps, A, A_t, P_dot_v = _FUNCTIONS(self)(z, v)
+        P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1) if self.rolling else A
+        return Kinematics(gaps[:, : self.n_contacts, 0], A, A_t, P, P_dot_v[..., 0])
 
     def evaluate_slip(self, z: Array) -> Array:
         """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""
         if not self.rolling:
             return np.zeros((len(z), 0))
-        return _ROLL_FUNCTIONS(self)(z, z)[0][..., 0]
+        return _FUNCTIONS(self)(z, z)[0][:, self.n_contacts :, 0]
 
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
@@ -187,7 +176,8 @@ _V = ca.SX.sym("v", 5)  # of all scenes, as z is
 
 def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     """Gap, rows A and A_t, A' v, slip coordinate [m] and A_t' v of a contact."""
-    pair, z = build_pair(contact, scene), build_features(scene).z
+    features = build_features(scene)
+    pair, z = features.pairs[contact], features.z
     A, A_t = (ca.jacobian(value, z) for value in (pair.gap, pair.slip))
     if contact.finger is not None and (contact.feature, contact.surface) == ("v", "tip"):
         # The slip is that at the arc, A_t that of the vertex, wherever it is.
@@ -197,22 +187,16 @@ def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
 
 
 def _build_function(formation: Formation) -> Batch:
-    scene = formation.scene
-    parts = [build_once(_build_part, contact, scene) for contact in formation.contacts]
-    outputs = [
-        ca.densify(ca.vertcat(ca.SX(0, width), *(part[k] for part in parts)))
-        for k, width in enumerate((1, 5, 5, 1))
-    ]
-    return Batch(ca.Function("formation", [build_features(scene).z, _V], outputs))
-
-
-def _build_roll_function(formation: Formation) -> Batch:
-    scene = formation.scene
-    z = build_features(scene).z
-    rolling = [formation.contacts[row] for row in formation.rolling_rows]
-    parts = [build_once(_build_part, contact, scene)[4:] for contact in rolling]
-    slip, bend = (ca.vertcat(ca.SX(0, 1), *column) for column in zip(*parts, strict=True))
-    return Batch(ca.Function("roll", [z, _V], [ca.densify(slip), ca.densify(bend)]))
+    parts = [_build_part(contact, formation.scene) for contact in formation.contacts]
+    rolling = [parts[row] for row in formation.rolling_rows]
+    rows = (
+        (1, [part[0] for part in parts] + [part[4] for part in rolling]),
+        (5, [part[1] for part in parts]),
+        (5, [part[2] for part in parts]),
+        (1, [part[3] for part in parts] + [part[5] for part in rolling]),
+    )
+    outputs = [ca.densify(ca.vertcat(ca.SX(0, width), *values)) for width, values in rows]
+    return Batch(ca.Function("formation", [build_features(formation.scene).z, _V], outputs))
 
 
 def _build_limit_function(formation: Formation) -> Batch:
@@ -220,8 +204,7 @@ def _build_limit_function(formation: Formation) -> Batch:
     return Batch(ca.Function("limits", [build_features(formation.scene).z], [values]))
 
 
-_FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts))
-_ROLL_FUNCTIONS = Store(_build_roll_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
+_FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
 
 
 def _identify_limits(formation: Formation) -> Hashable:

@@ -1,4 +1,4 @@
-"""Curve z(s) of a one-freedom formation: panels, tangent, curvature, reversals; parts of curves.
+"""Curve z(s) of a one-freedom formation: panels, tangent, curvature, reversals.
 
 The parameter is the arc length s in metres, in the metric
 
@@ -249,82 +249,3 @@ def describe_pose(z: Array) -> str:
     x, phi = 1e3 * float(z[0]), float(np.degrees(z[min(2, len(z) - 1)]))
     x, phi = round(x, 6) + 0.0, round(phi, 6) + 0.0
     return f"x = {x:.4g} mm, phi = {phi:.4g} deg"
-
-
-def find_on(curve: Curve, z: Array) -> float | None:
-    """Where a configuration, shape (5,), is on a curve [m]; None if it is not on it."""
-    rho, weights = curve.formation.scene.scales.length, metric_weights(curve.formation.scene)
-    near = 1e-9 * rho
-    away = (np.concatenate([panel.z for panel in curve.panels]) - z) ** 2 @ weights
-    first = int(away.argmin())
-    if away[first] > (0.2 * rho) ** 2:
-        return None
-    s = float(np.concatenate([panel.s for panel in curve.panels])[first])
-    for _ in range(8):
-        s = min(max(s, 0.0), curve.length)
-        at, tangent = curve.interpolate(np.array([s]))
-        change = float((z - at[0]) * weights @ tangent[0])
-        if abs(change) < near / 100:
-            break
-        s += change
-    return s if float(np.sqrt((z - at[0]) ** 2 @ weights)) < near else None
-
-
-def take(curve: Curve, start: float, stop: float) -> Curve:
-    """The part of a curve between two places [m], run from the first one to the second one."""
-    low, high = min(start, stop), max(start, stop)
-    back, length = start > stop, high - low
-    panels = []
-    for panel in curve.panels:
-        first, last = max(float(panel.s[0]), low), min(float(panel.s[-1]), high)
-        # What is missing at an end is extrapolated.
-        if last - first < 1e-9 * length:
-            continue
-        piece = panel
-        if (first, last) != (panel.s[0], panel.s[-1]):
-            # The same polynomial through other nodes.
-            s = first + (last - first) * (1 - np.cos(np.linspace(0, np.pi, len(panel.s)))) / 2
-            s[-1] = last
-            piece = Panel(s, *panel.interpolate(s))
-        columns = (high - piece.s)[::-1], piece.z[::-1], -piece.z_s[::-1]
-        panels.append(Panel(*columns) if back else Panel(piece.s - low, piece.z, piece.z_s))
-    sign = -1.0 if back else 1.0
-    segments = []
-    for part in curve.segments:
-        ends = max(part.start, low), min(part.stop, high)
-        if ends[1] - ends[0] > 1e-7 * length:
-            first, last = sorted(sign * (end - start) for end in ends)
-            # Zero has no sign.
-            segments.append(Segment(first, last, sign * part.Xi + 0.0, sign * part.sigma + 0.0))
-    step = -1 if back else 1
-    return _make(curve, panels[::step], segments[::step], length)
-
-
-def join(back: Curve | None, forth: Curve | None) -> Curve:
-    """One curve of two that lead away from a place, run back first; of one if there is one."""
-    if forth is None:
-        assert back is not None
-        return take(back, back.length, 0.0)
-    if back is None:
-        return forth
-    first, offset = take(back, back.length, 0.0), back.length
-    moved_panels = (Panel(offset + panel.s, panel.z, panel.z_s) for panel in forth.panels)
-    panels = [*first.panels, *moved_panels]
-    segments = list(first.segments)
-    for part in forth.segments:
-        moved = replace(part, start=offset + part.start, stop=offset + part.stop)
-        last = segments[-1]
-        if (last.Xi == moved.Xi).all() and (last.sigma == moved.sigma).all():
-            segments[-1] = replace(last, stop=moved.stop)
-        else:
-            segments.append(moved)
-    return _make(forth, panels, segments, offset + forth.length)
-
-
-def _make(curve: Curve, panels: list[Panel], segments: list[Segment], length: float) -> Curve:
-    segments[0] = replace(segments[0], start=0.0)
-    segments[-1] = replace(segments[-1], stop=length)
-    part = Curve(curve.formation, tuple(panels), length, "", False, curve.speed_ratio)
-    # Reversals are where they were.
-    part.__dict__["segments"] = tuple(segments)
-    return part

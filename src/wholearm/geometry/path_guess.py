@@ -18,7 +18,7 @@ from ..contacts.contact_limits import build_limits
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, Fixed, close_all, close_contacts, metric_weights
 from ..problem.definition import Phase
-from .curve import Curve, tangent_basis
+from .curve import tangent_basis
 from .tracing import require_touching, runs_on_curve, trace_phase
 
 GRID = (120, 60)  # places across x and phi at which a formation is looked at
@@ -115,19 +115,6 @@ class PathGuess:
         return float(np.sqrt(steps**2 @ metric_weights(self.formation.scene)).sum())
 
 
-def guess_curve(curve: Curve, share: float) -> list[PathGuess]:
-    """Path guesses along the first `share` of a curve, split at its reversals."""
-    stop = share * curve.length
-    parts = [part for part in curve.segments if part.start < stop]
-    guesses = []
-    signs = [np.concatenate([part.Xi, part.sigma]) for part in parts]
-    for part, here, there in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
-        s = np.linspace(part.start, min(part.stop, stop), POINTS)
-        turns, directions = np.flatnonzero(here != there).tolist(), Directions(part.Xi, part.sigma)
-        guesses.append(PathGuess(curve.formation, curve.evaluate(s).z, directions, tuple(turns)))
-    return guesses
-
-
 def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[PathGuess]:
     """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
@@ -141,7 +128,14 @@ def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[Pat
         raise InputError("", key, "the contacts leave no freedom to move")
     if freedoms == 1:
         curve = trace_phase(phase, z, later)
-        return guess_curve(curve, RELEASE_AT if phase.until.is_release else 1.0)
+        stop = (RELEASE_AT if phase.until.is_release else 1.0) * curve.length
+        parts, guesses = [part for part in curve.segments if part.start < stop], []
+        signs = [np.append(part.Xi, part.sigma) for part in parts]
+        for part, here, there in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
+            places = curve.evaluate(np.linspace(part.start, min(part.stop, stop), POINTS)).z
+            turns = tuple(np.flatnonzero(here != there).tolist())
+            guesses.append(PathGuess(formation, places, Directions(part.Xi, part.sigma), turns))
+        return guesses
     return [connect(formation, z, _find_goal(phase, z, later))]
 
 

@@ -99,15 +99,13 @@ class LimitSet:
 
         The last two are the speeds of the joints; torques are before them.
         """
-        more = [limit.rows[:, :-last].any() for limit in self.limits]
-        pairs = list(zip(self.limits, more, strict=True))
-        parts = (tuple(limit for limit, kind in pairs if kind == side) for side in (True, False))
-        first, second = map(LimitSet, parts)
-        return first, second
+        more = [limit for limit in self.limits if limit.rows[:, :-last].any()]
+        others = [limit for limit in self.limits if limit not in more]
+        return LimitSet(tuple(more)), LimitSet(tuple(others))
 
-    def weigh(self, parameter: Parameter) -> Array:
+    def weigh(self, key: str) -> Array:
         """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
-        weights = [(limit.parameter.key == parameter.key) * limit.weight for limit in self.limits]
+        weights = [(limit.parameter.key == key) * limit.weight for limit in self.limits]
         return np.concatenate(weights)
 
     @cached_property

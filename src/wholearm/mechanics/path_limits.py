@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
-from .limits import CONE, PRESS, LimitSet, make_limits
+from .limits import EPSILON, PRESS, LimitSet, make_limits
 
 TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
 FLAT = 1e-12  # slope over lambda below which a limit does not depend on it, over its scale
@@ -65,12 +65,12 @@ class PathLimits(NamedTuple):
         rows[..., ONE] += amount
         return self._replace(rows=rows)
 
-    def eliminate(self) -> PathLimits:
-        """Limits without lambda: one for each pair of rows, ordered as `triu_indices(m, 1)`.
+    def eliminate(self, column: int = LAMBDA) -> PathLimits:
+        """Limits without lambda, or a: one for each pair of rows, ordered as `triu_indices(m, 1)`.
 
         Without any influence of lambda, as with three contacts, they are the rows themselves.
         """
-        by = self.rows[..., LAMBDA]
+        by = self.rows[..., column]
         if not by.any():
             return self._replace(rows=self.rows[..., :LAMBDA])
         i, j = np.triu_indices(by.shape[-1], 1)
@@ -85,8 +85,11 @@ class PathLimits(NamedTuple):
         return self._replace(rows=rows)
 
     def pair(self, row: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The two rows that a row of `eliminate` combines, shape (..., 2)."""
-        return np.asarray(np.stack(np.triu_indices(self.rows.shape[-2], 1), axis=1)[row])
+        """The two rows that a row of `eliminate` combines, (..., 2); itself without lambda."""
+        first, second = np.triu_indices(self.rows.shape[-2], 1)
+        if not self.rows[..., LAMBDA].any():
+            return np.stack([row, row], axis=-1)
+        return np.stack([first[row], second[row]], axis=-1)
 
     def meet(self, b: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
         """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have no slack."""
@@ -133,15 +136,11 @@ class PathLimits(NamedTuple):
 
     def find_largest_b(self) -> Array:
         """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
-        of_a = self.rows[..., A]
-        up, down = np.maximum(of_a, 0)[:, :, None], np.maximum(-of_a, 0)[:, None, :]
-        one, b, v = (
-            down * self.rows[:, :, None, k] + up * self.rows[:, None, :, k] for k in (ONE, B, V)
-        )
+        rows = self.eliminate(A).rows
+        one, b, v = (rows[..., k] for k in (ONE, B, V))
         with np.errstate(divide="ignore", invalid="ignore"):
             root = (v + np.sqrt(np.maximum(v**2 - 4 * b * one, 0))) / (-2 * b)
-        bounded = (up > 0) & (down > 0) & (b < 0)
-        largest = np.where(bounded, np.maximum(root, 0), np.inf).min(axis=(1, 2))
+        largest = np.where(b < 0, np.maximum(root, 0), np.inf).min(axis=-1)
         return np.asarray(np.minimum(largest**2, self.cap))
 
 
@@ -211,20 +210,17 @@ class InternalForceLimits(NamedTuple):
         """Internal force that stands for an infinite one [N]."""
         return 1e6 * float(self.limits.scales[self.limits.of(PRESS)[0]])
 
-    def _split(self) -> tuple[NDArray[np.bool_], Array, NDArray[np.int64]]:
-        """Which sides give way to epsilon, by how much per newton, and the limits they are of."""
-        rows = self.limits.sides[0]
-        weights = np.concatenate([limit.weight for limit in self.limits.limits])[rows]
-        soft = np.isin(rows, self.limits.of(PRESS, CONE)) & (weights > 0)
-        weights = np.where(soft, weights, 0.0) / self.limits.scales[rows]
-        return soft, weights, self.limits.owners[rows]
+    @property
+    def weights(self) -> Array:
+        """By how much each side gives way per newton of epsilon, over its scale, (n_sides,)."""
+        return np.asarray((self.limits.weigh(EPSILON) / self.limits.scales)[self.limits.sides[0]])
 
     def find_span(self, a: Array, b: Array, epsilon: Array | float) -> tuple[Array, Array]:
         """Least and largest internal force with which all limits are kept, shape (n,) [N].
 
         The least is above the largest where there is none.
         """
-        loss = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self._split()[1])
+        loss = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self.weights)
         low, high = self.at.relax(-loss).find_internal_force_range(a, b)
         return np.maximum(low, -self.far), np.minimum(high, self.far)
 
@@ -232,33 +228,19 @@ class InternalForceLimits(NamedTuple):
         """The internal force with the largest least normal force, at a = s'', b = s'^2.
 
         The largest epsilon of c_n >= epsilon and of the cones of rolling contacts, within the other
-        limits: a linear programme in two unknowns, solved by its vertices.
+        limits: a linear programme in lambda and epsilon, here in the place of a = s''.
         """
-        soft, weights, owners = self._split()
-        offset, slope = self.at.find_slack(a, b, 0 * a), self.at.rows[..., LAMBDA]
-        others = self.at._replace(rows=self.at.rows[:, ~soft])
-        low, high = others.find_internal_force_range(a, b)
-        feasible = np.maximum(low, -self.far) <= np.minimum(high, self.far)
-        low, high = np.clip([low, high], -self.far, self.far)
-        # In newtons of epsilon.
-        rest, rise = offset[:, soft] / weights[soft], slope[:, soft] / weights[soft]
-        i, j = np.triu_indices(soft.sum(), 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            corners = (rest[:, j] - rest[:, i]) / (rise[:, i] - rise[:, j])
-        corners = np.where(np.isfinite(corners), corners, low[:, None])
-        tried = np.clip(np.column_stack([low, high, corners]), low[:, None], high[:, None])
-        least = (rest[:, None] + rise[:, None] * tried[..., None]).min(axis=2)
-        k, best = np.arange(len(a)), least.argmax(axis=1)
-        internal, value = tried[k, best], np.where(feasible, least[k, best], -np.inf)
-        slack = offset + slope * internal[:, None]
-        finite = np.isfinite(value)
-        slack[:, soft] -= np.where(finite, value, 0.0)[:, None] * weights[soft]
+        rows = np.zeros_like(self.at.rows)
+        rows[..., ONE], rows[..., A] = self.at.find_slack(a, b, 0 * a), -self.weights
+        rows[..., LAMBDA] = self.at.rows[..., LAMBDA]
+        limits = self.at._replace(rows=rows)
+        left = limits.eliminate()
+        others = np.where(left.rows[..., A] == 0, left.rows[..., ONE], np.inf)
+        feasible = others.min(axis=1) >= 0
+        least, _, row = left.extreme(0 * b, largest=True)
         # Where other limits cannot be kept it is these that are to blame.
-        slack[np.ix_(~finite, soft)] = np.inf
-        pair = np.argsort(np.where(finite[:, None], np.abs(slack), slack), axis=1)[:, :2]
-        # Where it has no effect, only those that are missed.
-        bent = np.abs(np.take_along_axis(slope, pair, axis=1)) > FLAT
-        free = np.take_along_axis(slack, pair, axis=1)[:, 1] > TIED
-        pair[:, 1] = np.where(free & ~bent.any(axis=1), pair[:, 0], pair[:, 1])
-        rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
-        return BestInternalForce(value, internal, rank % len(self.limits.limits))
+        pair = limits.pair(np.where(feasible, row, others.argmin(axis=1)))
+        # Zero where it has no influence.
+        internal = np.nan_to_num(limits.meet(0 * b, pair)[1])
+        owners = np.sort(self.limits.owners[self.limits.sides[0]][pair], axis=1)
+        return BestInternalForce(np.where(feasible, least, -np.inf), internal, owners)

@@ -474,7 +474,7 @@ class ImpactSequence:
         """The curves with such speed ratios that the speed is the same on both sides of a join."""
         ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
         return tuple(
-            curve.with_speed_ratio(float(ratio)) if ratio != 1 else curve
+            curve.with_speed_ratio(float(ratio))
             for curve, ratio in zip(self.curves, ratios, strict=True)
         )
 

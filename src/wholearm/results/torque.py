@@ -66,6 +66,13 @@ class TorqueProfile:
         signs = (-1.0) ** np.arange(self.coefficients.shape[2])
         return np.asarray(self.coefficients[1:] @ signs - self.coefficients[:-1].sum(axis=2))
 
+    @property
+    def slopes(self) -> TorqueProfile:
+        """Time derivative of the torques within the pieces [N m/s]."""
+        slopes = np.zeros_like(self.coefficients)
+        slopes[..., :-1] = self.coefficients[..., 1:] * np.arange(1, slopes.shape[2])
+        return TorqueProfile(self.breaks, slopes * (2 / np.diff(self.breaks))[:, None, None])
+
     def integrate_squares(self) -> float:
         """Integral of tau^T tau over all pieces [(N m)^2 s]."""
         degree = self.coefficients.shape[2]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of, find_on, join, take
+from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of
 from ..geometry.tracing import HELD, find_headings, trace_curve
 from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
@@ -248,41 +248,20 @@ class BorderEdge:
         return self.curve.formation
 
 
-def follow_borders(
-    place: RoadmapPlace, formation: Formation, terms: Terms, known: list[Curve]
-) -> list[BorderEdge]:
-    """The border of a formation from a place, in both directions.
-
-    Whole borders of the formation are taken from `known`, to which newly traced ones are added.
-    """
-    least = HELD * place.scene.scales.length
-    for whole in known:
-        s = find_on(whole, place.z)
-        if s is not None:
-            ends = (whole.length, 0.0) if find_headings(whole.formation, place.z) else ()
-            curves = [take(whole, s, end) for end in ends if abs(end - s) > least]
-            break
-    else:
-        curves = _trace(formation, place.z, known)
-    return [BorderEdge(place, curve, terms) for curve in curves]
-
-
-def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
-    """The curves of a formation from a configuration; joined, they are added to `known`."""
-    headings = find_headings(formation, z)
+def follow_borders(place: RoadmapPlace, formation: Formation, terms: Terms) -> list[BorderEdge]:
+    """The border of a formation from a place, in both directions."""
+    headings, least = find_headings(formation, place.z), HELD * place.scene.scales.length
     if not headings:
         return []
-    least, traced = HELD * formation.scene.scales.length, list[Curve | None]()
     # Most borders end where they start: then a limit is violated a small step ahead.
-    ahead = formation.evaluate_limits(z + least * np.array(headings)).min(axis=1)
+    ahead = formation.evaluate_limits(place.z + least * np.array(headings)).min(axis=1)
+    borders = []
     for heading, limit in zip(headings, ahead.tolist(), strict=True):
-        barred = limit < -BARRED * least
-        curve = None if barred else trace_curve(formation, z, heading, Until())
-        traced.append(curve if curve is not None and curve.length > least else None)
-    curves = [curve for curve in traced if curve is not None and curve.is_regular]
-    if curves and len(curves) == 2 - traced.count(None):
-        known.append(join(*traced[::-1]))
-    return curves
+        if limit >= -BARRED * least:
+            curve = trace_curve(formation, place.z, heading, Until())
+            if curve.length > least and curve.is_regular:
+                borders.append(BorderEdge(place, curve, terms))
+    return borders
 
 
 def point_out(contacts: Sequence[Contact], z: Array) -> Until:

@@ -21,7 +21,6 @@ from ..contacts.closing import Flags, Numbers, contact_table, first_contact, mov
 from ..contacts.closing import place as place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..geometry.curve import Curve
 from ..geometry.path_guess import is_inside
 from ..mapping.borders import NOWHERE, label_cells
 from ..mechanics.dynamics import ONE, Directions, close_contacts, force_rows, inverse
@@ -129,7 +128,7 @@ class Roadmap:
         self.scene, self.epsilon = problem.scene, problem.epsilon
         self.terms = Terms(problem.epsilon, uniqueness_margin)
         self.refined: set[Edge] = set()
-        self._curves: dict[frozenset[Contact], list[Curve]] = {}
+        self._formations: dict[frozenset[Contact], Formation] = {}
         self.plans: dict[object, Plan | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
         self.part_plans: dict[object, PartPlan | Lost] = {}
@@ -147,8 +146,9 @@ class Roadmap:
         closed, borders = close_place(place) if place.landed else place, list[BorderEdge]()
         for formation in list_formations_at(closed, 4) if closed else ():
             if closed and (chain is None or chain.can_enter(formation)):
-                curves = self._curves.setdefault(frozenset(formation.contacts), [])
-                make = partial(follow_borders, closed, formation, self.terms, curves)
+                # The same contacts, in whatever order, are one formation, compiled once.
+                shared = self._formations.setdefault(frozenset(formation.contacts), formation)
+                make = partial(follow_borders, closed, shared, self.terms)
                 borders += self._once(make, place.key, formation.contacts)
         return borders
 

@@ -22,21 +22,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, reduce
-from itertools import pairwise, product, takewhile
+from functools import cached_property, lru_cache
+from itertools import product, takewhile
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Expression, Independent, find_root
+from ..common.arrays import Array, Independent, find_root
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
-from .stepper import Modes, ModeStepper, bind
-from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Structure, System
+from .stepper import Modes
+from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, System
 
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
@@ -276,6 +275,14 @@ class ClosedContacts(NamedTuple):
     rows: ContactRows
 
 
+class StepEnd(NamedTuple):
+    """One end of a step."""
+
+    motion: Array  # (3, n): z, z' and z''
+    gaps: Array  # gaps, ranges (N,) [m]: of all pairs
+    ranges: Array
+
+
 class Pattern:
     """Closed pairs and coordinates at rest, and sliding signs of the others."""
 
@@ -360,7 +367,12 @@ class FreeRun(Run):
     resting   whether everything rests
     unique    whether the present modes were certainly the only solution
     residual  largest residual of a contact problem so far
+    watched   which pairs do not press, (N,)
+    level     gap at which a pair that touches closes, (N,) [m]
     """
+
+    before: StepEnd
+    after: StepEnd
 
     def __init__(
         self,
@@ -373,7 +385,7 @@ class FreeRun(Run):
         super().__init__(system, *start, **options)
         self.restitution = restitution
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
-        self.watch, self.unit = Watch(system), system.scales.length
+        self.unit = system.scales.length
         self.resting = self.unique = False
 
     def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
@@ -727,16 +739,15 @@ class FreeRun(Run):
     def move(self) -> None:
         """Integrate with the present modes until an event, or until the torques step or end."""
         self.load(self.modes)
-        rows, watch = self.s.rows, self.watch
-        self.kept = list(self.modes.kept)
-        watch.watched[:] = 1.0
-        watch.watched[self.kept] = 0.0
+        rows, self.kept = self.s.rows, list(self.modes.kept)
+        self.watched = ~np.isin(range(len(self.system.names)), self.kept)
         self.counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
         self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
         self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
-        sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
-        watch.level[:] = np.where(watch.gaps > -SUNK * self.unit, sunk, -np.inf)
+        gaps = self.before.gaps
+        sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
+        self.level = np.where(gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
         self.floor = np.maximum(self.slack, self.slack - self.values)
         self.h = min(self.h, self._time_to_return())
@@ -746,43 +757,32 @@ class FreeRun(Run):
     def look(self) -> None:
         """Start from the present state."""
         super().look()
-        self.longest = self.watch.advance()
+        self._advance()
 
-    def _sample(self, h: float) -> tuple[Array, Array, Array]:
-        """Instants of the step just made, of length h, both its ends too; gaps and ranges there."""
-        watch, n = self.watch, self.system.n
-        count = 1 + int(LOOKS * min(1.0, watch.travel / REACH))
-        times = h * np.arange(count + 1) / count
-        seen = [(watch.gaps[None], watch.ranges[None]), (watch.ahead[None], watch.spans[None])]
-        if count > 1:
-            knots = np.stack([watch.motion, watch.end], axis=0).reshape(2, 3, n).swapaxes(0, 1)
-            first = np.zeros(count - 1, dtype=np.int64)
-            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], tuple(knots), first)[0]
-            seen.insert(1, self.system.measure(z))
-        gaps, ranges = map(np.concatenate, zip(*seen, strict=True))
-        return times, gaps, ranges
+    def _advance(self) -> None:
+        """Start the next step, of `REACH` at most, from the end of the one just made."""
+        self.before = self.after
+        _, speed, push = np.abs(self.after.motion / self.system.units[: self.system.n]).max(axis=1)
+        root = math.sqrt(speed**2 + 2 * push * REACH)
+        self.longest = float(2 * REACH / (speed + root + 1e-300))
 
     def measure(self) -> Array:
         """Event values of the steps, then ranges of kept pairs."""
-        self.watch.look(self.s)
-        values = self.s.outputs[self.s.to.values]
-        return np.concatenate([values, self.watch.spans[self.kept] / self.unit])
+        out, to = self.s.outputs, self.s.to
+        motion = np.concatenate([out[: 2 * self.system.n], out[to.acceleration]])
+        motion = motion.reshape(3, self.system.n)
+        self.after = StepEnd(motion, *self.system.look(motion[0]))
+        return np.concatenate([out[to.values], self.after.ranges[self.kept] / self.unit])
 
     @property
     def shift(self) -> Array:
         """Values that start below zero may stay there: modes are judged a moment later."""
         return self.floor
 
-    def locate(self, h: float, t: float) -> list[int]:
-        """Shorten the step just made, of length `h` to `t`, to its first event, if there is one."""
-        watch, low = self.watch, (self.values < -self.floor).any()
-        # A shorter step is looked at where it ends, alone.
-        return self.find_first(h) if watch.alarm or low or watch.travel >= REACH / LOOKS else []
-
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        self.longest = self.watch.advance()
+        self._advance()
         self.floor = np.where(self.values > 0, self.slack, self.floor)
 
     def handle(self, found: list[int]) -> bool:
@@ -802,7 +802,7 @@ class FreeRun(Run):
 
     def _holds(self) -> bool:
         """Whether the modes are the only solution after a torque step, by more than rounding."""
-        modes, rows, watch = self.s.modes, self.s.rows, self.watch
+        modes, rows, at = self.s.modes, self.s.rows, self.before
         if not self.unique or modes.stuck or modes.held:
             return False
         clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
@@ -810,7 +810,7 @@ class FreeRun(Run):
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
         near = CLOSED * self.unit
-        touches = (np.abs(watch.gaps) < near) & (watch.ranges > -near) & (watch.watched > 0)
+        touches = (np.abs(at.gaps) < near) & (at.ranges > -near) & self.watched
         return bool((self.values > clear).all()) and not touches.any()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
@@ -831,9 +831,9 @@ class FreeRun(Run):
 
         def value(step: float) -> float:
             self.step_to(step)
-            return float(self.watch.ahead[pair]) - level
+            return float(self.after.gaps[pair]) - level
 
-        first = value(left) if left > 0 else float(self.watch.gaps[pair]) - level
+        first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
         last = value(right)
         if last >= 0 and right < h:
             # The bracket is that of an interpolation, which grazing may mislead.
@@ -850,12 +850,22 @@ class FreeRun(Run):
         self, h: float, passed: Sequence[int]
     ) -> tuple[int, float, float, float] | None:
         """The first pair whose gap falls below a level [m], that, and a bracket of when [s]."""
-        unit = self.unit
-        times, gaps, ranges = self._sample(h)
+        unit, start, end = self.unit, self.before, self.after
+        z, v, _ = np.abs(end.motion - start.motion)
+        travel = float(((z + h * v) / self.system.units[: self.system.n]).max())
+        count = 1 + int(LOOKS * min(1.0, travel / REACH))
+        times = h * np.arange(count + 1) / count
+        seen = [start.gaps, end.gaps], [start.ranges, end.ranges]
+        if count > 1:
+            knots = tuple(np.stack([start.motion, end.motion], axis=1))
+            first = np.zeros(count - 1, dtype=np.int64)
+            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
+            seen[0][1:1], seen[1][1:1] = self.system.measure(z)
+        gaps, ranges = map(np.array, seen)
         # What comes apart within the step may close again within it.
         apart = np.logical_or.accumulate(gaps[:-1] > ARMED * unit, axis=0)
-        level = np.where(apart, 0.0, self.watch.level)
-        crosses = (gaps[1:] < level) & (gaps[:-1] >= level) & (self.watch.watched > 0)
+        level = np.where(apart, 0.0, self.level)
+        crosses = (gaps[1:] < level) & (gaps[:-1] >= level) & self.watched
         crosses[:, passed] = False
         crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * unit
         rows, pairs = crosses.nonzero()
@@ -864,7 +874,7 @@ class FreeRun(Run):
             return pair, float(level[row, pair]), *times[row : row + 2].tolist()
         # The first one that comes into range apart or touching, and overlaps after that. Out of
         # range a gap has no meaning and may be negative throughout.
-        turns = (ranges[1:] > 0) & (ranges[:-1] <= 0) & (self.watch.watched > 0)
+        turns = (ranges[1:] > 0) & (ranges[:-1] <= 0) & self.watched
         turns &= (gaps[1:] < -CLOSED * unit) & (gaps[1:] > -REACH * unit)
         turns[:, passed] = False
         for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
@@ -872,7 +882,7 @@ class FreeRun(Run):
 
             def outside(step: float, pair: int = pair) -> float:
                 self.step_to(step)
-                return -float(self.watch.spans[pair])
+                return -float(self.after.ranges[pair])
 
             # When the pair comes into range.
             ends, entry = (-float(ranges[row, pair]), outside(right)), right
@@ -880,7 +890,7 @@ class FreeRun(Run):
                 flat = CLOSED * unit
                 entry = find_root(outside, left, right, ends, self.near, flat)
             self.step_to(entry)
-            gap = float(self.watch.ahead[pair])
+            gap = float(self.after.gaps[pair])
             if gap > -SUNK * unit:
                 return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
             self.step_to(h)
@@ -888,8 +898,8 @@ class FreeRun(Run):
 
     def _time_to_return(self) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
-        gaps, watched = self.watch.gaps, self.watch.watched > 0
-        near = watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
+        gaps = self.before.gaps
+        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
         if not near.any():
             return math.inf
         rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
@@ -898,72 +908,6 @@ class FreeRun(Run):
         # What parts more slowly was closed when the modes were chosen.
         back = (rate >= self.chatter) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))
-
-
-class Watch:
-    """Compiled look for pairs that close within a step, with the numbers of one run.
-
-    Attributes
-    ----------
-    motion, gaps, ranges    (3 n,) z, z' and z'', and (N,) [m], at the start of the step
-    end, ahead, spans       the same at its end
-    level : (N,) [m]        gap at which a pair that touches closes
-    watched : (N,)          1 for pairs that do not press
-    alarm                   whether some pair has closed, or has come into range and overlaps, by
-                            the end
-    travel                  length of the step in units of the scene
-    """
-
-    def __init__(self, system: System) -> None:
-        n, count = system.n, len(system.names)
-        sizes = np.cumsum([0, 3 * n, count, count, count, count, 3 * n, 1])
-        inputs, outputs = np.zeros(sizes[-1]), np.zeros(2 * count + 3)
-        parts = [inputs[first:last] for first, last in pairwise(sizes)]
-        self.motion, self.gaps, self.ranges, self.level, self.watched, self.end, self._h = parts
-        self.ahead, self.spans = outputs[:count], outputs[count : 2 * count]
-        self._start, self._seen = inputs[3 * n : 3 * n + 2 * count], outputs[: 2 * count]
-        self._flags, self._places = outputs[-3:], 2 * n
-        numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
-        self._look = bind(_build_watch(system.structure), [inputs, numbers], outputs)
-
-    def look(self, s: ModeStepper) -> None:
-        """Evaluate gaps and ranges at the end of the step just made."""
-        split, out = self._places, s.outputs
-        self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
-        self._h[0] = s.inputs[s.at.h]
-        self._look()
-        self.alarm, self.travel = bool(self._flags[1]), float(self._flags[2])
-
-    def advance(self) -> float:
-        """Start the next step from the end of this one; how long it may be, `REACH` at most [s]."""
-        self.motion[:], self._start[:] = self.end, self._seen
-        return float(self._flags[0])
-
-
-@lru_cache(maxsize=16)
-def _build_watch(structure: Structure) -> Expression:
-    """CasADi function of the vectors of `Watch`: gaps, ranges, longest step, alarm and travel."""
-    n, count = structure.n, len(structure.pairs)
-    sizes = [3 * n, count, count, count, count, 3 * n, 1]
-    inputs = ca.SX.sym("given", sum(sizes))
-    motion, gap, span, level, watched, end, h = ca.vertsplit(
-        inputs, np.cumsum([0, *sizes]).tolist()
-    )
-    g = structure.geometry.shape[0]
-    numbers = ca.SX.sym("numbers", g + 2 * n + 1)
-    geometry, units, unit = numbers[:g], numbers[g : g + n], numbers[-1]
-    gaps, ranges = ca.horzsplit(structure.gaps.function(end[:n], geometry))
-    gone = ca.fabs(end[: 2 * n] - motion[: 2 * n])
-    travel = ca.mmax((gone[:n] + h * gone[n:]) / units)
-    speed, push = (ca.mmax(ca.fabs(part) / units) for part in (end[n : 2 * n], end[2 * n :]))
-    longest = 2 * REACH / (speed + ca.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-    least = ca.if_else(gap > ARMED * unit, 0, level)
-    closes = ca.logic_and(gaps < least, gap >= least)
-    overlap = gaps < -CLOSED * unit, gaps > -REACH * unit
-    enters = reduce(ca.logic_and, (ranges > 0, span <= 0, *overlap))
-    alarm = ca.mmax(watched * ca.logic_or(closes, enters))
-    outputs = ca.vertcat(gaps, ranges, longest, alarm, travel)
-    return ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
 
 
 def _name(system: System, joint: int) -> str:

@@ -47,7 +47,7 @@ from ..common.arrays import Array, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import close_all, move_least
+from ..mechanics.dynamics import close_all, find_freedoms, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
@@ -360,8 +360,12 @@ class Rest:
         still[list(formation.rolling_rows)] = False
         if still.any():
             # What is stationary here has the direction that it has just after.
-            ahead = _find_rates(formation, self.z, 1e-5 / fastest, heading)
-            rates = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, ahead, 0.0), rates)
+            at = formation.evaluate(self.z[None], heading[None])
+            bend = -move_least(at.P, at.P_dot_v, formation.scene.mass_diagonal)[0]
+            rows = evaluate_rows(formation, self.z, heading)
+            ahead = np.concatenate([rows.A_t @ bend + rows.bend_t, bend[3:]])
+            moves = np.abs(ahead) > 1e-7 * fastest * scale
+            rates = np.where(still, np.where(moves, ahead, 0.0), rates)
         return np.asarray(np.sign(rates))
 
     def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
@@ -449,16 +453,6 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     return Rest(formation, z, statics, statics.freedoms[:, 0] if freedoms == 1 else None)
 
 
-def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
-    """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
-    slip = formation.evaluate_slip(z[None])[0]
-    ahead = require_closed(formation, z + step * heading, slip=slip)
-    kinematics = formation.evaluate(ahead[None], heading[None])
-    P, mass = kinematics.P, formation.scene.mass_diagonal
-    tangent = heading - move_least(P, P @ heading, mass)[0]
-    return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
-
-
 def _measure_drive(scene: Scene) -> float:
     """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
     return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
@@ -503,22 +497,17 @@ def _find_roots(polynomial: Array) -> list[float]:
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
 
 
-def require_closed(
-    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
-) -> Array:
+def require_closed(formation: Formation, z: Array, within: float = np.inf) -> Array:
     """Nearest configuration, in the metric M5, with every contact of the formation closed.
 
-    Gaps up to `within` [m] are closed; rolling contacts take coordinates `slip`, (R,) [m], if any.
-    A `SimulationError` says which contact cannot be closed.
+    Gaps up to `within` [m] are closed. A `SimulationError` says which contact cannot be closed.
     """
     gaps, mass = formation.evaluate(z[None], z[None]).C[0], formation.scene.mass_diagonal
     worst = int(np.abs(gaps).argmax())
     text = f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m,"
     if np.abs(gaps[worst]) > within:
         raise SimulationError(f"{text} does not touch")
-    if slip is None:
-        formation, slip = replace(formation, rolling=()), np.zeros(0)
-    closed = close_all(formation, z[None], slip, metric=mass)[0]
+    closed = close_all(replace(formation, rolling=()), z[None], np.zeros(0), metric=mass)[0]
     if not np.isfinite(closed).all():
         raise SimulationError(f"{text} cannot be closed")
     return np.asarray(closed)
@@ -625,13 +614,12 @@ def find_opening(place: Standstill) -> Array | None:
     scene = place.formation.scene
     at = place.z[None], np.zeros((1, 5))
     normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
-    root = np.sqrt(scene.mass_diagonal)
-    P, along = place.formation.evaluate(*at).P[0] / root, normal / root
-    free = along - P.T @ np.linalg.lstsq(P.T, along, rcond=_SMALL)[0]
-    rate = float(free @ along)
-    if rate <= 3e-5 * float(along @ along):
+    N = find_freedoms(place.formation.evaluate(*at).P[0], scene.mass_diagonal, _SMALL)
+    push = N.T @ normal
+    rate = float(push @ push)
+    if rate <= 3e-5 * float(normal**2 @ (1 / scene.mass_diagonal)):
         return None
-    return np.asarray(free / root / rate)
+    return np.asarray(N @ push / rate)
 
 
 def _find_closing(

@@ -34,10 +34,10 @@ from typing import Any, NamedTuple, NoReturn, cast
 import casadi as ca
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_lowest
 from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
-from ..contacts.elemental import build_features, build_pair
+from ..contacts.elemental import build_features
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
@@ -45,7 +45,7 @@ from ..results.torque import TorqueProfile
 from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES, ModeStepper, bind
+from .stepper import INNER_STAGES, NODES, bind
 from .system import (
     FIRST_STEP,
     REACHED,
@@ -79,73 +79,41 @@ def _interpolate_stages() -> tuple[Array, Array]:
 _PLACES, _INSIDE = _interpolate_stages()
 
 
-class ModeSegment(NamedTuple):
-    """A part of a phase with one set of contact modes.
+class PhaseEnds(NamedTuple):
+    """What ends a phase, as a compiled function of the state."""
 
-    Its event values, scaled, are those of `EventRows.force` and `cone`, and then these.
-    """
-
-    mode: modes.Mode
-    turning: slice  # sliding velocities times Xi, then joint speeds times sigma
-    limit: slice  # the formation's limits; that of the contact to be gained counts as `until`
-    until: int  # distance to the end of the phase; one if that is a release
-    # speed along the heading, in the metric M5; one with more than one freedom, where contacts and
-    # joints come to rest one by one
-    speed: int
-    slack: Array  # (m,): how far below zero each event value counts as rounding
-    # sets `event_values` from outputs of the steps and the `heading` at their start
-    measure: Any
-    # (5,): velocity at the start of a step, scaled to one in the metric M5, or the impending one
-    heading: Array
-    # m values, distance to the end [m or rad], its rate, heading
-    event_values: Array
-    until_unit: float  # [m or rad]: of the distance to the end of the phase
-    limits: list[str]  # what has happened where limits that end the phase early are reached
+    evaluate: Any  # sets `values` from `state`
+    state: Array  # (10,): z, z'
+    # gaps of the formation's limits that end the phase early [m], then the distance to its end, one
+    # if that is a release [m or rad], and the time derivative of that
+    values: Array
+    texts: list[str]  # what has happened where these limits are reached
+    unit: float  # of the distance [m or rad]
 
 
 @lru_cache(maxsize=64)
-def _build_leg(
-    formation: Formation, until: Until, side: float, s: ModeStepper, mode: modes.Mode
-) -> ModeSegment:
-    """A segment with the steps of its mode, before it gets a phase and a number."""
-    scene, layout = formation.scene, s.rows
-    gained = [limit for limit in formation.limits if limit.gains(until.contact)]
+def _build_ends(formation: Formation, until: Until, side: float) -> PhaseEnds:
+    """Ends of a phase that comes to a coordinate from a `side`, 1 from above."""
+    scene = formation.scene
+    gained = [limit.value for limit in formation.limits if limit.gains(until.contact)]
     limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
-    last = layout.slide.stop + 2
-    until_row = last + len(limits)
-    rows = slice(layout.slide.start, last), slice(last, until_row), until_row, until_row + 1
-    sizes = [layout.cone.stop, last - layout.cone.stop, len(limits), 1, 1]
-    # Of speeds 2e-13 is rounding.
-    slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
-    z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
-    values = ca.SX.sym("values", layout.size)
+    features, v = build_features(scene), ca.SX.sym("v", 5)
     if until.is_release:
         distance = ca.SX(1)
     elif until.contact is None:
         row, value = until.poses[0]
-        distance = side * (z[row] - value)
+        distance = side * (features.z[row] - value)
     elif gained:
         # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
-        distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
+        distance = ca.mmin(ca.vertcat(*gained))
     else:
-        distance = build_pair(until.contact, scene).gap
-    mass, unit = ca.DM(scene.mass_diagonal), scene.scales.speed * scene.scales.mass**0.5
-    speed = ca.dot(before, mass * v) / unit if mode.n_constraints >= 4 else ca.SX(1)
-    gaps = [limit.value / scene.scales.length for limit in limits]
-    unit_until = 1.0 if until.coordinate == "phi" else scene.scales.length
-    reached = distance / unit_until
-    every = ca.vertcat(values[: layout.slide.stop], values[-2:], *gaps, reached, speed)
-    size = ca.sqrt(ca.dot(v, mass * v))
-    heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
-    outputs = ca.vertcat(every, distance, ca.jtimes(distance, z, v), heading)
-    inner = ca.Function("measure", [z, v, values, before], [ca.densify(outputs)])
-    packed, start = ca.MX.sym("packed", s.to.size), ca.MX.sym("start", 5)
-    measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
-    function = ca.Function("measure", [packed, start], [measured])
-    start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
-    measure = bind(function, [s.outputs, start], event_values)
-    texts = [limit.text for limit in limits]
-    return ModeSegment(mode, *rows, slack, measure, start, event_values, unit_until, texts)
+        distance = features.pairs[until.contact].gap
+    parts = *(limit.value for limit in limits), distance, ca.jtimes(distance, features.z, v)
+    function = ca.Function("ends", [ca.vertcat(features.z, v)], [ca.densify(ca.vertcat(*parts))])
+    state, values = np.zeros(10), np.zeros(len(parts))
+    evaluate, texts = bind(function, [state], values), [limit.text for limit in limits]
+    unit = 1.0 if until.coordinate == "phi" else scene.scales.length
+    return PhaseEnds(evaluate, state, values, texts, unit)
 
 
 class Stop(Enum):
@@ -166,7 +134,11 @@ class Replay(Run):
     settling, rest_window : [s], rounding : [N]
                              see the constants of these names
     slip_signs               signs of contacts, by name, that have just begun to slip
-    side                     sign of (coordinate - value) before the end of the phase
+    ends                     what ends the phase
+    distance, rate           distance to its end [m or rad], and the time derivative of that
+    mode                     what rolls, sticks and is held
+    heading : (5,)           velocity at the start of a step, or the impending one, over its size in
+                             the metric M5
     passes                   whether the end may be passed at any speed, without an impact
     moving                   whether the motion goes on into the next phase
     stuck                    contacts, then joints, that stick while the rest moves
@@ -174,7 +146,9 @@ class Replay(Run):
     least                    c_n of contacts up to now in the phase, over the scene's force
     """
 
-    leg: ModeSegment
+    ends: PhaseEnds
+    mode: modes.Mode
+    heading: Array
     phase: Phase
     following: Phase | None  # the next phase
     least: Array
@@ -194,7 +168,7 @@ class Replay(Run):
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
-        self.side = 1.0
+        self.distance = self.rate = 0.0
         self.passes = self.moving = False
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
@@ -219,29 +193,38 @@ class Replay(Run):
         """Go on with the steps of a mode of the phase's formation."""
         self.load(mode.find_modes())
         self.signs = np.zeros(self.formation.n_contacts + 2)
-        self.leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
-        self.slack = self.leg.slack
-        self.leg.heading[:] = 0.0
+        self.mode, self.heading = mode, np.zeros(5)
+        rows, count = self.s.rows, len(self.ends.texts)
+        self.turning = slice(rows.slide.start, rows.slide.stop + 2)
+        self.limit = slice(self.turning.stop, self.turning.stop + count)
+        sizes = [rows.cone.stop, self.turning.stop - rows.cone.stop, count, 1, 1]
+        # Of speeds 2e-13 is rounding.
+        self.slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
 
     def measure(self) -> Array:
-        """Event values after the step just made."""
-        self.leg.measure()
-        return self.leg.event_values[:-7].copy()
+        """Event values after the step just made, scaled.
+
+        Forces and margins of friction; sliding velocities times Xi, and speeds of the joints times
+        sigma; limits of the formation but that of the contact to be gained; distance to the end of
+        the phase; speed along the heading, in the metric M5. The last is one with more than one
+        freedom, where contacts and joints come to rest one by one.
+        """
+        out, ends, scales = self.s.outputs, self.ends, self.system.scales
+        ends.state[:] = out[:10]
+        ends.evaluate()
+        self.distance, self.rate = ends.values[-2:].tolist()
+        values, speed = out[self.s.to.values], 1.0
+        if self.mode.n_constraints >= 4:
+            size = float(self.heading @ (self.system.mass * out[5:10]))
+            speed = size / (scales.speed * scales.mass**0.5)
+        moving = values[: self.s.rows.slide.stop], values[-2:]
+        last = self.distance / ends.unit, speed
+        return np.concatenate([*moving, ends.values[:-2] / scales.length, last])
 
     @property
     def shift(self) -> Array:
         """A value that starts within rounding of zero has to fall below that."""
         return np.where(self.start > self.slack, 0.0, self.slack)
-
-    @property
-    def distance(self) -> float:
-        """Distance to the end of the phase there [m or rad]."""
-        return float(self.leg.event_values[-7])
-
-    @property
-    def rate(self) -> float:
-        """Time derivative of the distance."""
-        return float(self.leg.event_values[-6])
 
     def observe(self) -> None:
         """Evaluate the present state, and record it."""
@@ -251,7 +234,8 @@ class Replay(Run):
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        self.leg.heading[:] = self.leg.event_values[-5:]
+        if self.v.any():
+            self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
         self.require_inertia()
 
     def require_inertia(self) -> None:
@@ -461,30 +445,16 @@ class Replay(Run):
         dips = inside.min(axis=0) < least - 1e-7
         if not dips.any():
             return [], math.inf
-        samples: dict[float, tuple[Record, Array, bool]] = {}
-
-        def look(x: float) -> None:
-            if 0 < x < 1 and x not in samples:
-                self.step_to(x * h)
-                record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
-                samples[x] = record, self.values, bool((self.values + self.slack < 0).any())
-                self.least = np.minimum(self.least, self.values[force])
-
-        for row in np.flatnonzero(dips).tolist():
-            middle = min(max(int(inside[:, row].argmin()), 1), len(_PLACES) - 2)
-            around = _PLACES[middle - 1 : middle + 2].tolist()
-            for x in around:
-                look(x)
-            ends = {0.0: stage_margins[0], 1.0: stage_margins[-1]}
-            values = [(samples[x][1] if x in samples else ends[x])[row] for x in around]
-            fall, rise = np.diff(values) / np.diff(around)
-            if rise > fall:
-                span = (around[2] - around[0]) / (rise - fall)
-                look(float(around[0] + around[1] - fall * span) / 2)
+        lowest = {find_lowest(_PLACES, inside[:, row])[1] for row in np.flatnonzero(dips)}
+        records, shown = list[Record](), math.inf
+        for x in sorted(lowest):
+            self.step_to(x * h)
+            records.append(Record.of(s, self.t + x * h, self.phase_index, self.impact))
+            self.least = np.minimum(self.least, self.values[force])
+            if (self.values + self.slack < 0).any():
+                shown = min(shown, x * h)
         self.step_to(h)
-        states = [samples[x] for x in sorted(samples)]
-        shown = [x for x in sorted(samples) if samples[x][2]]
-        return [record for record, _, _ in states], shown[0] * h if shown else math.inf
+        return records, shown
 
     def _is_at_end(self, t: float) -> bool:
         """Whether the step just tried ends the phase, at a torque break and but for rounding.
@@ -497,7 +467,7 @@ class Replay(Run):
             return False
         speed = abs(self._measure_rate())
         if self.passes:
-            distance = self.distance / self.leg.until_unit
+            distance = self.distance / self.ends.unit
             # Of several breaks as near as that, the nearest is the one at which the phase ends.
             later = self.breaks[self.piece + 2 : self.piece + 3]
             time = self.problem.scene.scales.time
@@ -541,21 +511,20 @@ class Replay(Run):
 
     def handle(self, kinds: Sequence[int]) -> Ending | None:
         """End the motion at events, or go on."""
-        leg = self.leg
-        if leg.until in kinds:
+        if len(self.slack) - 2 in kinds:
             return self._reach()
-        if leg.speed in kinds:
+        if len(self.slack) - 1 in kinds:
             return self.come_to_rest()
         pulling = [k for k in kinds if k < self.s.rows.force.stop]
         if pulling:
             return self.let_go(pulling)
-        cone, limit, mode = self.s.rows.cone, leg.limit, leg.mode
+        cone, limit, mode = self.s.rows.cone, self.limit, self.mode
         bounds = [k - cone.start for k in kinds if cone.start <= k < cone.stop]
         if any(mode.declares(k % len(mode.holders)) for k in bounds):
             return self.slip()
         reached = [] if bounds else [k for k in kinds if limit.start <= k < limit.stop]
         if reached:
-            text = self.note(EventKind.LIMIT, leg.limits[reached[0] - limit.start])
+            text = self.note(EventKind.LIMIT, self.ends.texts[reached[0] - limit.start])
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
@@ -580,7 +549,7 @@ class Replay(Run):
         if not speed or not self.rate:
             return 0.0
         rows = modes.evaluate_rows(self.formation, self.z, v)
-        response = modes.respond(self.leg.mode, self.signs, rows, v)
+        response = modes.respond(self.mode, self.signs, rows, v)
         if response is None:
             return 0.0
         later = self.breaks[self.piece + 1 : bisect_right(self.breaks, self.t + longest)]
@@ -591,7 +560,7 @@ class Replay(Run):
         if slowing[0] <= 1e-2 * np.abs(slowing).max():
             return 0.0
         # A millionth of the scene's length is what a plan and its replay differ by.
-        left = max(abs(self.distance) - 1e-6 * self.leg.until_unit, 0.0) * speed / abs(self.rate)
+        left = max(abs(self.distance) - 1e-6 * self.ends.unit, 0.0) * speed / abs(self.rate)
         latest = 1.1 * max(2 * speed / slowing[0], math.sqrt(6 * left / slowing[0]))
         fades = t[slowing <= 1e-3 * slowing[0]]
         if len(fades) and fades[0] - self.t <= latest:
@@ -602,7 +571,7 @@ class Replay(Run):
 
     def _measure_rate(self) -> float:
         """Time derivative of the distance to the end of the phase, in units of the scene."""
-        return self.rate / self.leg.until_unit * self.problem.scene.scales.time
+        return self.rate / self.ends.unit * self.problem.scene.scales.time
 
     def _time_to_stop(self) -> float:
         """Time in which the motion would stop at its present deceleration [s]."""
@@ -637,10 +606,11 @@ class Replay(Run):
         self.passes = phase.end is End.SMOOTH and (
             gained is None or takes_over(gained, formation.scene, formation.contacts)
         )
-        self.side = 1.0
+        side = 1.0
         if until.value is not None:
             row, value = until.poses[0]
-            self.side = math.copysign(1.0, self.y[row] - value)
+            side = math.copysign(1.0, self.y[row] - value)
+        self.ends = _build_ends(formation, until, side)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         self.take(modes.find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
@@ -697,15 +667,15 @@ class Replay(Run):
 
     def start_with(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
         """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
-        if mode != self.leg.mode:
+        if mode != self.mode:
             self.take(mode)
         self.signs = signs
-        self.leg.heading[:] = heading
+        self.heading = heading
 
     def go_on(self) -> Ending | None:
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
-        self.leg.heading[:] = v / np.sqrt(self.system.mass @ v**2)
+        self.heading = v / np.sqrt(self.system.mass @ v**2)
         rates = np.concatenate([modes.evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
         movable = [row for unit in modes.list_units(formation) for row in unit.rows]
         signs = np.zeros(len(rates))
@@ -733,7 +703,7 @@ class Replay(Run):
         self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()
-        reserves, holders = self._measure_reserves(), self.leg.mode.holders
+        reserves, holders = self._measure_reserves(), self.mode.holders
         slipping = {holders[k][0] for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE}
         pulling: list[int] = np.flatnonzero(self.s.outputs[self.s.to.c_n] < -self.rounding).tolist()
         # Whether anything pulls where a contact slips by plan, its next formation says.
@@ -757,7 +727,7 @@ class Replay(Run):
             self.signs = signs
             return False
         self.look()
-        slow = np.abs(self.values[self.leg.turning]) < STANDING
+        slow = np.abs(self.values[self.turning]) < STANDING
         still = [
             unit
             for unit in modes.list_units(formation)
@@ -819,7 +789,7 @@ class Replay(Run):
 
     def slip(self) -> Ending:
         """End because a rolling contact slips, or starts to part where its release is planned."""
-        s, holders, reserves = self.s, self.leg.mode.holders, self._measure_reserves()
+        s, holders, reserves = self.s, self.mode.holders, self._measure_reserves()
         out = [k for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE]
         planned = [k for k in out if holders[k][0] in self.slipping]
         row = holders[min(planned or reserves, key=reserves.__getitem__)][0]
@@ -832,13 +802,13 @@ class Replay(Run):
 
     def _find_turning(self, events: Sequence[int]) -> list[int]:
         """Contacts, then joints, whose sliding or turning is among events."""
-        turning = self.leg.turning
+        turning = self.turning
         return [k - turning.start for k in events if turning.start <= k < turning.stop]
 
     def _measure_reserves(self) -> dict[int, float]:
         """Friction margin of the forces that hold what rolls by plan, over the scene's force."""
         reserves = self.values[self.s.rows.cone].reshape(2, -1).min(axis=0).tolist()
-        return {k: x for k, x in enumerate(reserves) if self.leg.mode.declares(k)}
+        return {k: x for k, x in enumerate(reserves) if self.mode.declares(k)}
 
     def coast(self, stop: float) -> None:
         """Step to `stop`, whatever happens on the way, without a record of the forces there."""
@@ -856,7 +826,7 @@ class Replay(Run):
 
     def is_there(self) -> bool:
         """Whether the distance to the end of the phase counts as none, at rest."""
-        return abs(self.distance) < REACHED * self.leg.until_unit
+        return abs(self.distance) < REACHED * self.ends.unit
 
     def _bridge(self, longest: float) -> bool:
         """Integrate between a reversal and its torque step, unrecorded; whether motion has ended.
@@ -876,7 +846,7 @@ class Replay(Run):
             self.start = self.values
             stretch = min(window, self.stop - self.t)
             self.step_to(stretch)
-            rows = self._find_turning(self.find_first(stretch, self.leg.turning))
+            rows = self._find_turning(self.find_first(stretch, self.turning))
             if not rows:
                 self.look()
                 return False

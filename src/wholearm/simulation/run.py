@@ -107,9 +107,9 @@ class Run(ABC):
     def shift(self) -> Array:
         """How far below zero each event value has to fall, by its value before the step."""
 
-    @abstractmethod
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made, of length `h` to `t` [s], to its first events; their rows."""
+        return self.find_first(h)
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
         """The first pair that closes within the step just made, of length `h`, and when [s].

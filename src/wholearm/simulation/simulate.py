@@ -130,9 +130,8 @@ def simulate_phases(
     problem: Problem,
     plan: Trajectory,
     *,
-    restitution: float = 0.0,
-    tolerance: float = 1e-9,
     progress: Callable[[str], None] | None = None,
+    **options: float,
 ) -> list[tuple[range, Simulation]]:
     """Simulate the phases of a plan one by one, each from its planned start, with free contacts.
 
@@ -141,8 +140,8 @@ def simulate_phases(
 
     Parameters
     ----------
-    problem, restitution, tolerance  as of `simulate`
     progress  told which phase is simulated
+    options   restitution and tolerance, as of `simulate`
     """
     starts, simulations = plan.phase_starts, []
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
@@ -156,8 +155,7 @@ def simulate_phases(
         state = np.concatenate([plan.z[row], plan.z_dot[row]])
         hint = _recall(problem, plan, row)
         clock = starts[first:stop].tolist()
-        options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
-        simulation = _simulate(problem, profile, state, clock, hint, **options)
+        simulation = _simulate(problem, profile, state, clock, hint, None, **options)
         simulations.append((range(first, stop), simulation))
     return simulations
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_lowest
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
@@ -378,37 +378,10 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
     return texts
 
 
-def find_lowest(t: Array, values: Array, shortest: float = 0.0) -> tuple[float, float]:
-    """Least value of a smooth function and where, refined by parabolas through three samples.
-
-    Times t, (n,) [s], never decrease. Parabolas are spoiled by rounding in intervals below
-    `shortest`.
-    """
-    first = int(values.argmin())
-    least, time = float(values[first]), float(t[first])
-    left, right = np.diff(t)[:-1], np.diff(t)[1:]
-    smooth = (left > shortest) & (right > shortest)
-    smooth &= (values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])
-    left, right, middle = left[smooth], right[smooth], t[1:-1][smooth]
-    fall = (values[1:-1] - values[:-2])[smooth] / left
-    rise = (values[2:] - values[1:-1])[smooth] / right
-    slope = (fall * right + rise * left) / (left + right)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.nan_to_num(-slope * (left + right) / (2 * (rise - fall)))
-    lowest = values[1:-1][smooth] + slope * shift / 2
-    if len(lowest) and lowest.min() < least:
-        k = int(lowest.argmin())
-        least, time = float(lowest[k]), float(middle[k] + shift[k])
-    return least, time
-
-
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
     """Commands that motors with some lags, shape (2,) [s], make torques of: tau + lag tau'."""
-    order = np.arange(1, torque.coefficients.shape[2])
-    slopes = np.zeros_like(torque.coefficients)
-    slopes[..., :-1] = torque.coefficients[..., 1:] * order
-    slopes *= (2 / np.diff(torque.breaks))[:, None, None]
-    return TorqueProfile(torque.breaks, torque.coefficients + lag[:, None] * slopes)
+    change = lag[:, None] * torque.slopes.coefficients
+    return TorqueProfile(torque.breaks, torque.coefficients + change)
 
 
 def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
@@ -417,8 +390,8 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     if not scene.has_slow_motors:
         return []
     x = np.linspace(-1, 1, 33)
-    values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
-    rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
+    rates = torque.slopes.at_places(x)
+    commands = torque.at_places(x) + scene.actuator_lag[:, None] * rates
     times = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * (1 + x) / 2
     misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)

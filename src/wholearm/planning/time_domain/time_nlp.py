@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
 from ...contacts.contact_limits import build_limits, list_renamed
-from ...contacts.elemental import Contact, build_features, build_pair
+from ...contacts.elemental import Contact, build_features
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, find_vanishing, tangent_basis
 from ...mechanics.dynamics import build_force_rows
@@ -435,7 +435,7 @@ def add_limits(
     elif goal is Objective.ELASTIC:
         weights[limits.of(*{limit.kind for limit in limits.without(SPEED).limits})] = 1.0
     elif target.relaxation is not None:
-        weights = limits.weigh(target.relaxation)
+        weights = limits.weigh(target.relaxation.key)
 
     def give(added: Indices, row: int) -> None:
         """Add the slack of a limit's row, if it has one."""
@@ -744,7 +744,7 @@ def point_kernel(formation: Formation, controls: int, homotopy: bool = False) ->
     if homotopy:
         Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
-        gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
+        gaps[n_c:] -= formation.build_constraints(s.first, s.v)[0][n_c:]
     push = build_force_rows(formation, P, A_t, Xi).T @ s.forces
     at_joints = ca.reshape(s.tau, 2, controls) @ p.shares - ca.DM(scene.dry[3:]) * sigma
     applied = push + ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, at_joints)
@@ -766,7 +766,8 @@ def end_kernel(formation: Formation) -> Kernel:
     x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
     gaps, P, _, _ = formation.build_constraints(x.z, x.v)
     if formation.rolling:
-        gaps[formation.n_contacts :] -= formation.roll_function(x.first, x.v)[0]
+        n_c = formation.n_contacts
+        gaps[n_c:] -= formation.build_constraints(x.first, x.v)[0][n_c:]
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
@@ -836,7 +837,7 @@ def goal_kernel(
     parts: list[Expression] = [ca.SX(0, 1)]
     if until is not None and until.contact is not None:
         # Where a contact changes its name its gap has no gradient, but the end of its range has.
-        gap = build_pair(until.contact, scene).gap
+        gap = build_features(scene).pairs[until.contact].gap
         parts.append(gap if row is None else formation.limits[row].value)
     if until is not None:
         parts += [z[row] - value for row, value in until.poses]
