@@ -8,7 +8,7 @@ import stat
 from typing import Any, BinaryIO
 
 from .document import describe_differences, find_differences
-from .errors import InputError
+from .errors import InputError, name_file
 from .signals import held
 
 try:
@@ -53,7 +53,7 @@ class Journal:
             text = "another run is writing to it; wait for its end, or choose another with -o"
             raise InputError(path, "", text) from None
         except OSError as error:
-            raise self._fail(error) from None
+            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> Journal:
         return self
@@ -68,10 +68,8 @@ class Journal:
     def add(self, record: dict[str, Any]) -> None:
         """Keep a record; an `InputError` if it cannot be written."""
         self.records.append(record)
-        try:
+        with name_file(self.path, failure="cannot be written"):
             self._write((json.dumps(record) + "\n").encode())
-        except OSError as error:
-            raise self._fail(error) from None
 
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
@@ -105,9 +103,6 @@ class Journal:
         left = memoryview(line)
         while left:
             left = left[self._stream.write(left) :]
-
-    def _fail(self, error: OSError) -> InputError:
-        return InputError(self.path, "", f"cannot be written: {error.strerror}")
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:
