@@ -69,7 +69,7 @@ class Heuristic(NamedTuple):
     most: int  # most places that are expanded
 
 
-EAGER = Heuristic(14.0, 4.0, 130)
+EAGER: Heuristic = Heuristic(14.0, 4.0, 130)
 """As routes through cells take: greedy, leads to a first plan soon."""
 CAREFUL = Heuristic(4.0, 2.5, 50)
 """Hardly any route takes less: finds routes that start in the wrong direction.
