@@ -113,7 +113,7 @@ def _start(
     """Fork a child that takes tasks, and sends its answers."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
-    arguments = tasks, source, (answers, far), known, os.getpid()
+    arguments = tasks, source, far, known, os.getpid()
     process = context.Process(target=_serve, args=arguments, daemon=True)
     try:
         # No signal may meet the child before it has said what it does about it.
@@ -149,11 +149,7 @@ def end_with_parent(parent: int) -> None:
 
 
 def _serve(
-    tasks: Sequence[Task[Any]],
-    source: int,
-    ends: tuple[Connection, Connection],
-    known: Sequence[object],
-    parent: int,
+    tasks: Sequence[Task[Any]], source: int, far: Connection, known: Sequence[object], parent: int
 ) -> None:
     """Take tasks for as long as there are any, and send what has come of them."""
     # The parent alone answers an interrupt, and ends its children.
@@ -161,9 +157,6 @@ def _serve(
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     end_with_parent(parent)
-    near, far = ends
-    # Nobody would read what is sent if the parent were gone.
-    near.close()
     # What there is by now is not looked at for garbage, which would copy its pages.
     gc.freeze()
     try:
