@@ -42,10 +42,8 @@ class Journal:
                     if fcntl is not None:
                         # Keeps others from the file until it is closed, or this process ends.
                         fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if fresh:
-                        self._stream.truncate(0)
                     self._stream.seek(0)
-                    self._begin(self._stream.read(), again)
+                    self._begin(b"" if fresh else self._stream.read(), again)
             except BaseException:
                 self.close()
                 raise
@@ -74,23 +72,21 @@ class Journal:
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
         head = (json.dumps(self._stamp) + "\n").encode()
-        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"]
+        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]), self._stamp["study"]
         if other.get("study") == kind and other.get("source") != self._stamp.get("source"):
             given = b""
         # Half of the first line is what a full disk leaves.
         if not head.startswith(given):
-            text = ""
-            if other.get("study") != kind:
-                text = f"no {kind} study"
-            elif differences := list(find_differences(other, self._stamp)):
-                text = f"another study: {describe_differences(differences, 'in the file', 'now')}"
-            if text:
-                what = f"holds {text}; --fresh begins anew, or choose another with -o"
-                raise InputError(self.path, "", what)
+            differences = find_differences(other, self._stamp)
+            if text := describe_differences(differences, "in the file", "now"):
+                same = other.get("study") == kind
+                what = f"another study: {text}" if same else f"no {kind} study"
+                text = f"holds {what}; --fresh begins anew, or choose another with -o"
+                raise InputError(self.path, "", text)
             first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
             entries = [(line, _parse(line)) for line in lines]
-            kept = [entry for entry in entries if not (again and (entry[1] or {}).get("findings"))]
-            self.records = [record for _, record in kept if record is not None]
+            kept = [entry for entry in entries if not (again and entry[1].get("findings"))]
+            self.records = [record for _, record in kept if record]
             whole = b"".join([first, *(line for line, _ in kept)])
         with held():
             if given.startswith(whole):
@@ -105,10 +101,10 @@ class Journal:
             left = left[self._stream.write(left) :]
 
 
-def _parse(line: bytes) -> dict[str, Any] | None:
-    """The record of a line; None if it is none."""
+def _parse(line: bytes) -> dict[str, Any]:
+    """The record of a line; empty if it is none."""
     try:
         record = json.loads(line)
     except ValueError:
-        return None
-    return record if isinstance(record, dict) else None
+        return {}
+    return record if isinstance(record, dict) else {}
