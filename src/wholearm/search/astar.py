@@ -485,7 +485,7 @@ class RoutePlanner:
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
     def _share(self, tasks: Sequence[Task[T]], order: Sequence[int] = ()) -> list[T]:
-        return share(tasks, self.jobs, (self.problem, self.problem.scene), order)
+        return share(tasks, self.jobs, order)
 
     def _release(self, edge: Edge, path: RefinedPath) -> CoarsePlan | None:
         """Plan an edge that leaves its border at another place, or in motion."""
