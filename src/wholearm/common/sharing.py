@@ -2,19 +2,18 @@
 
 Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
 uses CasADi holds one lock (`exclusive`), and what it leaves behind is never deleted outside of it:
-values that belong to objects (`Store`) are set aside when their owners go, and an error that leaves
-the package takes no local variables along.
+what is built of an object is kept elsewhere (`Store`), and an error that leaves the package takes
+no local variables along.
 """
 
 from __future__ import annotations
 
 import os
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from functools import wraps
 from threading import RLock
 from typing import Any, Generic, ParamSpec, TypeVar
-from weakref import WeakKeyDictionary, WeakValueDictionary, finalize
 
 import numpy as np
 
@@ -24,8 +23,6 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 LOCK = RLock()  # held by whoever uses CasADi
-_retired: deque[object] = deque()
-"""Values whose owners are gone, to be deleted by the next holder of the lock."""
 
 if hasattr(os, "register_at_fork"):
     # A child process must not start from the middle of another thread's call.
@@ -40,46 +37,37 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         with LOCK:
-            _retired.clear()
             try:
                 return function(*args, **kwargs)
             except BaseException as error:
                 _drop_locals(error)
                 raise
-            finally:
-                _retired.clear()
 
     return run
 
 
-class _Share(Generic[_T]):
-    """A value that each of its owners holds."""
-
-    def __init__(self, value: _T) -> None:
-        self.value = value
-
-
 class Store(Generic[_T]):
-    """Values made of CasADi objects that several owners share, for as long as one of them lives.
+    """Values made of CasADi objects, of which the `size` last used are kept.
 
     `build` makes the value of an owner; owners for which `identify` gives equal keys share one.
     """
 
+    size = 1024
+
     def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:
         self._build, self._identify = build, identify
-        self._shares: WeakKeyDictionary[Any, _Share[_T]] = WeakKeyDictionary()
-        self._known: WeakValueDictionary[Hashable, _Share[_T]] = WeakValueDictionary()
+        self._values: OrderedDict[Hashable, _T] = OrderedDict()
 
     @exclusive
     def __call__(self, owner: object) -> _T:
         """Return the value of `owner`."""
-        if owner not in self._shares:
-            key = self._identify(owner)
-            share = self._known.get(key) or _Share(self._build(owner))
-            self._known[key] = self._shares[owner] = share
-            # Set aside, and not deleted, when its owner is.
-            finalize(owner, _retired.append, share).atexit = False
-        return self._shares[owner].value
+        key = self._identify(owner)
+        if key not in self._values:
+            self._values[key] = self._build(owner)
+        self._values.move_to_end(key)
+        if len(self._values) > self.size:
+            self._values.popitem(last=False)
+        return self._values[key]
 
 
 def _drop_locals(error: BaseException) -> None:
