@@ -2,7 +2,7 @@
 
 Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
 uses CasADi holds one lock (`exclusive`), and what it leaves behind is never deleted outside of it:
-what is built of an object is kept elsewhere (`Store`), and an error that leaves the package takes
+what is built of an object is kept elsewhere (`stored`), and an error that leaves the package takes
 no local variables along.
 """
 
@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from functools import wraps
 from threading import RLock
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -46,28 +46,31 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return run
 
 
-class Store(Generic[_T]):
-    """Values made of CasADi objects, of which the `size` last used are kept.
+def stored(
+    identify: Callable[[Any], Hashable], size: int = 1024
+) -> Callable[[Callable[[Any], _T]], Callable[[Any], _T]]:
+    """Have a function keep what it builds of CasADi objects, the values that were used last.
 
-    `build` makes the value of an owner; owners for which `identify` gives equal keys share one.
+    Owners for which `identify` gives equal keys share one value; there are `size` of them.
     """
 
-    size = 1024
+    def decorate(build: Callable[[Any], _T]) -> Callable[[Any], _T]:
+        values: OrderedDict[Hashable, _T] = OrderedDict()
 
-    def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:
-        self._build, self._identify = build, identify
-        self._values: OrderedDict[Hashable, _T] = OrderedDict()
+        @wraps(build)
+        @exclusive
+        def find(owner: Any) -> _T:
+            key = identify(owner)
+            if key not in values:
+                values[key] = build(owner)
+            values.move_to_end(key)
+            if len(values) > size:
+                values.popitem(last=False)
+            return values[key]
 
-    @exclusive
-    def __call__(self, owner: object) -> _T:
-        """Return the value of `owner`."""
-        key = self._identify(owner)
-        if key not in self._values:
-            self._values[key] = self._build(owner)
-        self._values.move_to_end(key)
-        if len(self._values) > self.size:
-            self._values.popitem(last=False)
-        return self._values[key]
+        return find
+
+    return decorate
 
 
 def _drop_locals(error: BaseException) -> None:

@@ -10,7 +10,7 @@ from itertools import accumulate
 import casadi as ca
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Store
+from ..common.sharing import Batch, stored
 from ..scene.model import Scene
 from .elemental import Contact, GapLimit, build_features, build_once, candidate_contacts
 
@@ -55,17 +55,14 @@ def build_finger_gap(scene: Scene) -> Expression:
     return separate(first, second, size) - thickness
 
 
+@stored(lambda scene: scene.shape)
 def _build_finger_gaps(scene: Scene) -> Batch:
-    function = ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)])
-    return Batch(function)
-
-
-_FINGER_GAPS = Store(_build_finger_gaps, lambda scene: scene.shape)
+    return Batch(ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)]))
 
 
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
     """Signed distance of the links at configurations z (n, 5), shape (n,) [m]."""
-    return _FINGER_GAPS(scene)(z)[0][:, 0, 0]
+    return _build_finger_gaps(scene)(z)[0][:, 0, 0]
 
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
@@ -233,14 +230,12 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
     Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
     the largest separation in any direction, independent of the pairs.
     """
-    return _GAPS(scene)(z)[0][..., 0]
+    return _build_gaps(scene)(z)[0][..., 0]
 
 
+@stored(lambda scene: (scene.shape, scene.fingers_collide))
 def _build_gaps(scene: Scene) -> Batch:
     features = build_features(scene)
     gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
     gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
     return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))
-
-
-_GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))
