@@ -78,6 +78,8 @@ def _drop_locals(error: BaseException) -> None:
 
     They may hold CasADi objects, and the error is dropped where nobody holds the lock.
     """
+    from traceback import clear_frames  # no plan needs it
+
     seen: set[int] = set()
     pending: list[BaseException | None] = [error]
     while pending:
@@ -86,13 +88,7 @@ def _drop_locals(error: BaseException) -> None:
             continue
         seen.add(id(one))
         pending += [one.__cause__, one.__context__]
-        trace = one.__traceback__
-        while trace is not None:
-            try:
-                trace.tb_frame.clear()
-            except RuntimeError:
-                pass  # still running: it has its variables anyway
-            trace = trace.tb_next
+        clear_frames(one.__traceback__)
 
 
 class Batch:
