@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import gc
 import io
-import itertools
 import multiprocessing
 import os
 import pickle
@@ -80,11 +79,6 @@ def test_results_are_in_order() -> None:
         return lambda: meet() and k
 
     assert share([task(k) for k in range(1, 5)], 2) == [1, 2, 3, 4]
-
-
-def test_one_process_begins_tasks_in_the_order_asked_for() -> None:
-    begun = itertools.count()
-    assert share([lambda: next(begun)] * 3, 1, order=[2, 0, 1]) == [1, 2, 0]
 
 
 @needs_fork

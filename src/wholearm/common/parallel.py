@@ -50,7 +50,7 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-def share(tasks: Sequence[Task[_T]], jobs: int, order: Sequence[int] = ()) -> list[_T]:
+def share(tasks: Sequence[Task[_T]], jobs: int) -> list[_T]:
     """Results of tasks, in their order.
 
     Processes are forked on Linux alone, where libraries bear it, if this one may have children and
@@ -61,17 +61,15 @@ def share(tasks: Sequence[Task[_T]], jobs: int, order: Sequence[int] = ()) -> li
     ----------
     tasks  without arguments. What they return has to be picklable.
     jobs   most processes, this one included
-    order  numbers of all tasks as they are begun, if not in their order
     """
     global _sharing
     count = min(jobs, len(tasks)) - 1
     if count < 1 or _sharing or not can_fork():
-        made = {k: tasks[k]() for k in order or range(len(tasks))}
-        return [made[k] for k in range(len(tasks))]
+        return [task() for task in tasks]
     _sharing, children = True, list[tuple[BaseProcess, Connection]]()
     source, sink = os.pipe()
     try:
-        os.write(sink, b"".join(k.to_bytes(2, "big") for k in order or range(len(tasks))))
+        os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
         os.close(sink)
         for _ in range(count):
             children.append(_start(tasks, source))
