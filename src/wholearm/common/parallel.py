@@ -16,7 +16,6 @@ import gc
 import math
 import multiprocessing as mp
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -153,7 +152,7 @@ def _serve(tasks: Sequence[Task[Any]], source: int, far: Connection, parent: int
     except KeyboardInterrupt:
         return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
-        far.send_bytes(pickle_deep(results))
+        far.send(results)
 
 
 def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
@@ -168,16 +167,6 @@ def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
         with suppress(Exception):
             results[index] = tasks[index]()
     return results
-
-
-def pickle_deep(value: object) -> bytes:
-    """A pickle of an object that is nested deeply, as places and edges of a roadmap are."""
-    deepest = sys.getrecursionlimit()
-    sys.setrecursionlimit(max(deepest, 20_000))
-    try:
-        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-    finally:
-        sys.setrecursionlimit(deepest)
 
 
 _CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
