@@ -23,6 +23,7 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 LOCK = RLock()  # held by whoever uses CasADi
+KEPT = 512  # most values of a `stored` function; a route of a polygon with 12 corners takes 180
 
 if hasattr(os, "register_at_fork"):
     # A child process must not start from the middle of another thread's call.
@@ -47,11 +48,11 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
 
 
 def stored(
-    identify: Callable[[Any], Hashable], size: int = 1024
+    identify: Callable[[Any], Hashable],
 ) -> Callable[[Callable[[Any], _T]], Callable[[Any], _T]]:
     """Have a function keep what it builds of CasADi objects, the values that were used last.
 
-    Owners for which `identify` gives equal keys share one value; there are `size` of them.
+    Owners for which `identify` gives equal keys share one value.
     """
 
     def decorate(build: Callable[[Any], _T]) -> Callable[[Any], _T]:
@@ -64,7 +65,7 @@ def stored(
             if key not in values:
                 values[key] = build(owner)
             values.move_to_end(key)
-            if len(values) > size:
+            if len(values) > KEPT:
                 values.popitem(last=False)
             return values[key]
 
