@@ -29,7 +29,7 @@ def test_parameters_are_all_numbers_by_their_shortest_names(box: Problem) -> Non
     assert not {"viscous1", "flush", "object.mass", "length"} & {*names}
     joint = find_parameter(box, "base2_x")
     assert joint.value == -0.1 and joint.unit == "m"
-    assert joint.set(box, -0.101).scene.fingers[1].base[0] == -0.101  # type: ignore[index]
+    assert box.with_({joint.name: -0.101}).scene.fingers[1].base[0] == -0.101  # type: ignore[index]
 
 
 @pytest.mark.parametrize("text, words", [
@@ -46,7 +46,7 @@ def test_what_cannot_be_chosen_is_refused(box: Problem, text: str, words: str) -
 
 def test_what_cannot_be_reached_may_be_chosen(box: Problem) -> None:
     # The fingers are too short to touch the box, which is no mistake in a file.
-    require_allowed(box, find_parameter(box, "length"), 0.04, "--over")
+    require_allowed(box, "length", 0.04, "--over")
 
 
 def test_a_symmetric_hand_mirrors_the_joint(box: Problem) -> None:

@@ -635,7 +635,7 @@ def test_a_report_holds_what_was_given(tmp_path: Path) -> None:
     plan_of(HEPTAGON).save(str(paths[0]))
     paths[1].write_text("t,tau1,tau2\n0,3,2.1\n0.5,3,2.1\n", encoding="utf-8")
     source = HEPTAGON.read_text(encoding="utf-8")
-    text = build_report(problem_of(HEPTAGON), list(map(str, paths)), source, chart=chart())
+    text = build_report(problem_of(HEPTAGON), list(map(str, paths)), source)
     for words in ("plan.npz", "ok: ", "v3-finger1", "[fingers.1]", "torques.csv"):
         assert words in text
     assert text.count("what verify says") == 2 and len(text) < 5e6

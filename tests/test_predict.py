@@ -473,8 +473,8 @@ def test_figures_are_those_of_verify(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     problem, (moved, *_) = first_phase(), write(tmp_path)
     for other, text in (
-        (problem.with_(mass=0.3), r"object\.mass: 0\.\d+ in the trajectory, 0\.\d+ in the problem"),
-        (problem_of(HEPTAGON), "phases: 1 entries in the trajectory, 5 in the problem"),
+        (problem.with_(mass=0.3), r"object\.mass \(0\.\d+ in the trajectory, 0\.\d+ here\)"),
+        (problem_of(HEPTAGON), r"phases \(1 entries in the trajectory, 5 here\)"),
         (problem.with_({"phases[1].until": {"x": 0.02}}), r"phases\[1\]\.until"),
     ):
         with pytest.raises(InputError, match=text) as caught:
@@ -482,7 +482,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
         assert caught.value.source == moved
     compare(problem.with_(epsilon=0.01, name="other"), [moved])
     assert main(["compare", str(HEPTAGON), moved]) == 2
-    assert "moved.npz: phases: 1 entries" in capsys.readouterr().err
+    assert "moved.npz: made for another problem: phases (1 entries" in capsys.readouterr().err
     odd = tmp_path / "odd.csv"
     odd.write_text("# simulations = many\nt,tau1,tau2\n0,0,0\n1,0,0\n", encoding="utf-8")
     with pytest.raises(InputError, match="'many' given"):

@@ -732,11 +732,9 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
             points.append((max(error, 1e-16), seconds))
             hollow += points[-1:] * any(row["outcome"] != SOLVED for row in group)
         look: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
-        axes.plot(*np.reshape(points, (-1, 2)).T, label=method, **look)
+        axes.loglog(*np.reshape(points, (-1, 2)).T, label=method, **look)
         look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
-        axes.plot(*np.reshape(hollow, (-1, 2)).T, **look)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+        axes.loglog(*np.reshape(hollow, (-1, 2)).T, **look)
     axes.set_title(f"{study[0].upper()}{study[1:]}")
     what = "relative error of the phase time" if planning else "error of z and z' in scene units"
     axes.set_xlabel(f"{what}, median over phases [-]")

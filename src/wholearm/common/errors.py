@@ -121,6 +121,15 @@ def name_source(source: str) -> Iterator[None]:
         raise InputError(source, error.key, error.problem) from None
 
 
+@contextmanager
+def name_file(path: object, key: str = "", failure: str = "cannot be read") -> Iterator[None]:
+    """Make an `InputError` of an `OSError` from inside the block: the file, what fails and why."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(path), key, f"{failure}: {error.strerror or error}") from None
+
+
 class InfeasibleError(WholearmError):
     """No motion satisfies the constraints; the message names constraint, phase and place.
 

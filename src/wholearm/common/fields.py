@@ -47,12 +47,6 @@ class Range:
         """Whether only whole numbers are allowed."""
         return isinstance(self.low, int)
 
-    @property
-    def schema(self) -> Schema:
-        """JSON Schema of the range."""
-        kind = "integer" if self.whole else "number"
-        return {"type": kind, "minimum": self.low, "maximum": self.high}
-
     def describe(self, time: str = "the scene's time") -> str:
         """The range in words."""
         low, high = (f"{end}" if self.whole else f"{end:g}" for end in (self.low, self.high))
@@ -184,7 +178,8 @@ class Field:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """The value's JSON Schema."""
+        """The value's JSON Schema; only keys of files have one, and no options."""
+        assert isinstance(self.kind, FieldKind)
         annotations = {"default": self.shown_default, "description": self.text}
         return {**self.kind.schema} | {k: v for k, v in annotations.items() if v not in (None, "")}
 

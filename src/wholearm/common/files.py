@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .errors import InputError
+from .errors import InputError, name_file
 from .signals import held, on_end
 
 LARGEST = 2**28  # largest array that is read [byte]: a million rows of everything take less
@@ -49,14 +49,12 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     An existing file is replaced, and what is not a file (a device, a pipe) is written to.
     """
     target = os.fspath(path)
-    try:
+    with name_file(target, failure="cannot be written"):
         if _is_special(target):
             with open(target, "wb") as stream:
                 write(stream)
         else:
             _replace(os.path.realpath(target), write)
-    except OSError as error:
-        raise InputError(target, "", f"cannot be written: {error.strerror}") from None
 
 
 @contextmanager
@@ -68,10 +66,8 @@ def together() -> Iterator[None]:
         yield
         with held():
             for part, target in staged:
-                try:
+                with name_file(target, failure="cannot be written"):
                     os.replace(part, target)
-                except OSError as error:
-                    raise InputError(target, "", f"cannot be written: {error.strerror}") from None
     finally:
         _staged.reset(token)
         for part, _ in staged:
@@ -95,10 +91,8 @@ def read_json(path: str) -> Any:
 
 def make_folder(path: str, key: str = "") -> None:
     """Make a folder if it is not there; an `InputError` that names the key if it cannot be made."""
-    try:
+    with name_file(path, key, "cannot be made"):
         os.makedirs(path, exist_ok=True)
-    except OSError as error:
-        raise InputError(path, key, f"cannot be made: {error.strerror}") from None
 
 
 def _is_special(target: str) -> bool:
@@ -156,7 +150,7 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
 
     source, arrays = str(path), dict[str, Any]()
     try:
-        with open(path, "rb") as stream:
+        with name_file(path), open(path, "rb") as stream:
             if stream.read(6) == b"\x93NUMPY":
                 raise InputError(source, "", "is not a trajectory file: one array, no archive")
             with zipfile.ZipFile(stream) as archive:
@@ -174,8 +168,6 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
                     except (ValueError, OverflowError, MemoryError) as error:
                         text = f"is no array of numbers or text: {error}"
                         raise InputError(source, name, text) from None
-    except OSError as error:
-        raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
     except (ValueError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
         raise InputError(source, "", f"is not a trajectory file: {e}") from None
     return arrays

@@ -8,7 +8,7 @@ import stat
 from typing import Any, BinaryIO
 
 from .document import describe_differences, find_differences
-from .errors import InputError
+from .errors import InputError, name_file
 from .signals import held
 
 try:
@@ -42,10 +42,8 @@ class Journal:
                     if fcntl is not None:
                         # Keeps others from the file until it is closed, or this process ends.
                         fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if fresh:
-                        self._stream.truncate(0)
                     self._stream.seek(0)
-                    self._begin(self._stream.read(), again)
+                    self._begin(b"" if fresh else self._stream.read(), again)
             except BaseException:
                 self.close()
                 raise
@@ -53,7 +51,7 @@ class Journal:
             text = "another run is writing to it; wait for its end, or choose another with -o"
             raise InputError(path, "", text) from None
         except OSError as error:
-            raise self._fail(error) from None
+            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> Journal:
         return self
@@ -68,31 +66,27 @@ class Journal:
     def add(self, record: dict[str, Any]) -> None:
         """Keep a record; an `InputError` if it cannot be written."""
         self.records.append(record)
-        try:
+        with name_file(self.path, failure="cannot be written"):
             self._write((json.dumps(record) + "\n").encode())
-        except OSError as error:
-            raise self._fail(error) from None
 
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
         head = (json.dumps(self._stamp) + "\n").encode()
-        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"]
+        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]), self._stamp["study"]
         if other.get("study") == kind and other.get("source") != self._stamp.get("source"):
             given = b""
         # Half of the first line is what a full disk leaves.
         if not head.startswith(given):
-            text = ""
-            if other.get("study") != kind:
-                text = f"no {kind} study"
-            elif differences := list(find_differences(other, self._stamp)):
-                text = f"another study: {describe_differences(differences, 'in the file', 'now')}"
-            if text:
-                what = f"holds {text}; --fresh begins anew, or choose another with -o"
-                raise InputError(self.path, "", what)
+            differences = find_differences(other, self._stamp)
+            if text := describe_differences(differences, "in the file", "now"):
+                same = other.get("study") == kind
+                what = f"another study: {text}" if same else f"no {kind} study"
+                text = f"holds {what}; --fresh begins anew, or choose another with -o"
+                raise InputError(self.path, "", text)
             first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
             entries = [(line, _parse(line)) for line in lines]
-            kept = [entry for entry in entries if not (again and (entry[1] or {}).get("findings"))]
-            self.records = [record for _, record in kept if record is not None]
+            kept = [entry for entry in entries if not (again and entry[1].get("findings"))]
+            self.records = [record for _, record in kept if record]
             whole = b"".join([first, *(line for line, _ in kept)])
         with held():
             if given.startswith(whole):
@@ -106,14 +100,11 @@ class Journal:
         while left:
             left = left[self._stream.write(left) :]
 
-    def _fail(self, error: OSError) -> InputError:
-        return InputError(self.path, "", f"cannot be written: {error.strerror}")
 
-
-def _parse(line: bytes) -> dict[str, Any] | None:
-    """The record of a line; None if it is none."""
+def _parse(line: bytes) -> dict[str, Any]:
+    """The record of a line; empty if it is none."""
     try:
         record = json.loads(line)
     except ValueError:
-        return None
-    return record if isinstance(record, dict) else None
+        return {}
+    return record if isinstance(record, dict) else {}

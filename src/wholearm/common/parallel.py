@@ -13,11 +13,9 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import io
 import math
 import multiprocessing as mp
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -51,9 +49,7 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-def share(
-    tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = (), order: Sequence[int] = ()
-) -> list[_T]:
+def share(tasks: Sequence[Task[_T]], jobs: int) -> list[_T]:
     """Results of tasks, in their order.
 
     Processes are forked on Linux alone, where libraries bear it, if this one may have children and
@@ -64,29 +60,25 @@ def share(
     ----------
     tasks  without arguments. What they return has to be picklable.
     jobs   most processes, this one included
-    known  what results may refer to: they then have these very objects
-    order  numbers of all tasks as they are begun, if not in their order
     """
     global _sharing
     count = min(jobs, len(tasks)) - 1
     if count < 1 or _sharing or not can_fork():
-        made = {k: tasks[k]() for k in order or range(len(tasks))}
-        return [made[k] for k in range(len(tasks))]
+        return [task() for task in tasks]
     _sharing, children = True, list[tuple[BaseProcess, Connection]]()
     source, sink = os.pipe()
     try:
-        os.write(sink, b"".join(k.to_bytes(2, "big") for k in order or range(len(tasks))))
+        os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
         os.close(sink)
         for _ in range(count):
-            children.append(_start(tasks, source, known))
+            children.append(_start(tasks, source))
         results = _take(tasks, source)
         for _, answers in children:
             # A child that was ended, or met an error, sends nothing.
             with suppress(EOFError, OSError):
                 while not answers.poll(0.1):
                     beat()
-                answer = io.BytesIO(answers.recv_bytes())
-                results |= _Unpickler(answer, known).load()
+                results |= answers.recv()
         return [results[k] if k in results else task() for k, task in enumerate(tasks)]
     finally:
         _sharing = False
@@ -107,13 +99,11 @@ def can_fork() -> bool:
     )
 
 
-def _start(
-    tasks: Sequence[Task[Any]], source: int, known: Sequence[object]
-) -> tuple[BaseProcess, Connection]:
+def _start(tasks: Sequence[Task[Any]], source: int) -> tuple[BaseProcess, Connection]:
     """Fork a child that takes tasks, and sends its answers."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
-    arguments = tasks, source, (answers, far), known, os.getpid()
+    arguments = tasks, source, far, os.getpid()
     process = context.Process(target=_serve, args=arguments, daemon=True)
     try:
         # No signal may meet the child before it has said what it does about it.
@@ -148,22 +138,13 @@ def end_with_parent(parent: int) -> None:
             os._exit(1)
 
 
-def _serve(
-    tasks: Sequence[Task[Any]],
-    source: int,
-    ends: tuple[Connection, Connection],
-    known: Sequence[object],
-    parent: int,
-) -> None:
+def _serve(tasks: Sequence[Task[Any]], source: int, far: Connection, parent: int) -> None:
     """Take tasks for as long as there are any, and send what has come of them."""
     # The parent alone answers an interrupt, and ends its children.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     end_with_parent(parent)
-    near, far = ends
-    # Nobody would read what is sent if the parent were gone.
-    near.close()
     # What there is by now is not looked at for garbage, which would copy its pages.
     gc.freeze()
     try:
@@ -171,7 +152,7 @@ def _serve(
     except KeyboardInterrupt:
         return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
-        far.send_bytes(pickle_deep(results, known))
+        far.send(results)
 
 
 def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
@@ -186,41 +167,6 @@ def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
         with suppress(Exception):
             results[index] = tasks[index]()
     return results
-
-
-class _Pickler(pickle.Pickler):
-    """Pickles with numbers in place of objects that both sides know."""
-
-    def __init__(self, stream: io.BytesIO, known: Sequence[object]) -> None:
-        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
-        self._numbers = {id(shared_object): k for k, shared_object in enumerate(known)}
-
-    def persistent_id(self, obj: object) -> int | None:
-        return self._numbers.get(id(obj))
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, known: Sequence[object]) -> None:
-        super().__init__(stream)
-        self._known = known
-
-    def persistent_load(self, pid: int) -> object:
-        return self._known[pid]
-
-
-def pickle_deep(value: object, known: Sequence[object] = ()) -> bytes:
-    """A pickle of an object that is nested deeply, as places and edges of a roadmap are.
-
-    Objects that are `known` to who loads it are numbers in it.
-    """
-    stream = io.BytesIO()
-    deepest = sys.getrecursionlimit()
-    sys.setrecursionlimit(max(deepest, 20_000))
-    try:
-        _Pickler(stream, known).dump(value)
-    finally:
-        sys.setrecursionlimit(deepest)
-    return stream.getvalue()
 
 
 _CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up

@@ -2,19 +2,18 @@
 
 Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
 uses CasADi holds one lock (`exclusive`), and what it leaves behind is never deleted outside of it:
-values that belong to objects (`Store`) are set aside when their owners go, and an error that leaves
-the package takes no local variables along.
+what is built of an object is kept elsewhere (`stored`), and an error that leaves the package takes
+no local variables along.
 """
 
 from __future__ import annotations
 
 import os
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from functools import wraps
 from threading import RLock
-from typing import Any, Generic, ParamSpec, TypeVar
-from weakref import WeakKeyDictionary, WeakValueDictionary, finalize
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -24,8 +23,7 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
 LOCK = RLock()  # held by whoever uses CasADi
-_retired: deque[object] = deque()
-"""Values whose owners are gone, to be deleted by the next holder of the lock."""
+KEPT = 512  # most values of a `stored` function; a route of a polygon with 12 corners takes 180
 
 if hasattr(os, "register_at_fork"):
     # A child process must not start from the middle of another thread's call.
@@ -40,46 +38,40 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         with LOCK:
-            _retired.clear()
             try:
                 return function(*args, **kwargs)
             except BaseException as error:
                 _drop_locals(error)
                 raise
-            finally:
-                _retired.clear()
 
     return run
 
 
-class _Share(Generic[_T]):
-    """A value that each of its owners holds."""
+def stored(
+    identify: Callable[[Any], Hashable],
+) -> Callable[[Callable[[Any], _T]], Callable[[Any], _T]]:
+    """Have a function keep what it builds of CasADi objects, the values that were used last.
 
-    def __init__(self, value: _T) -> None:
-        self.value = value
-
-
-class Store(Generic[_T]):
-    """Values made of CasADi objects that several owners share, for as long as one of them lives.
-
-    `build` makes the value of an owner; owners for which `identify` gives equal keys share one.
+    Owners for which `identify` gives equal keys share one value.
     """
 
-    def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:
-        self._build, self._identify = build, identify
-        self._shares: WeakKeyDictionary[Any, _Share[_T]] = WeakKeyDictionary()
-        self._known: WeakValueDictionary[Hashable, _Share[_T]] = WeakValueDictionary()
+    def decorate(build: Callable[[Any], _T]) -> Callable[[Any], _T]:
+        values: OrderedDict[Hashable, _T] = OrderedDict()
 
-    @exclusive
-    def __call__(self, owner: object) -> _T:
-        """Return the value of `owner`."""
-        if owner not in self._shares:
-            key = self._identify(owner)
-            share = self._known.get(key) or _Share(self._build(owner))
-            self._known[key] = self._shares[owner] = share
-            # Set aside, and not deleted, when its owner is.
-            finalize(owner, _retired.append, share).atexit = False
-        return self._shares[owner].value
+        @wraps(build)
+        @exclusive
+        def find(owner: Any) -> _T:
+            key = identify(owner)
+            if key not in values:
+                values[key] = build(owner)
+            values.move_to_end(key)
+            if len(values) > KEPT:
+                values.popitem(last=False)
+            return values[key]
+
+        return find
+
+    return decorate
 
 
 def _drop_locals(error: BaseException) -> None:
@@ -87,6 +79,8 @@ def _drop_locals(error: BaseException) -> None:
 
     They may hold CasADi objects, and the error is dropped where nobody holds the lock.
     """
+    from traceback import clear_frames  # no plan needs it
+
     seen: set[int] = set()
     pending: list[BaseException | None] = [error]
     while pending:
@@ -95,13 +89,7 @@ def _drop_locals(error: BaseException) -> None:
             continue
         seen.add(id(one))
         pending += [one.__cause__, one.__context__]
-        trace = one.__traceback__
-        while trace is not None:
-            try:
-                trace.tb_frame.clear()
-            except RuntimeError:
-                pass  # still running: it has its variables anyway
-            trace = trace.tb_next
+        clear_frames(one.__traceback__)
 
 
 class Batch:

@@ -10,7 +10,7 @@ from itertools import accumulate, product
 import casadi as ca
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Store
+from ..common.sharing import Batch, stored
 from ..scene.model import Scene
 from .elemental import Contact, GapLimit, build_features, candidate_contacts
 
@@ -55,16 +55,14 @@ def build_finger_gap(scene: Scene) -> Expression:
     return separate(first, second, size) - thickness
 
 
-def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
-    """Signed distance of the links at configurations z (n, 5), shape (n,) [m]."""
-    return _FINGER_GAPS(scene)(z)[0][:, 0, 0]
-
-
+@stored(lambda scene: scene.shape)
 def _build_finger_gaps(scene: Scene) -> Batch:
     return Batch(ca.Function("gap", [build_features(scene).z], [build_finger_gap(scene)]))
 
 
-_FINGER_GAPS = Store(_build_finger_gaps, lambda scene: scene.shape)
+def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
+    """Signed distance of the links at configurations z (n, 5), shape (n,) [m]."""
+    return _build_finger_gaps(scene)(z)[0][:, 0, 0]
 
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
@@ -202,11 +200,12 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     for inside in ranges:
         gap = ca.fmax(gap, -inside)
     if contact.feature == "e" and not touching:
-        others = _OTHER_GAPS(scene)[contact.surface, contact.finger]
+        others = _list_other_gaps(scene)[contact.surface, contact.finger]
         gap = ca.fmax(gap, others[contact.index] - pair.gap)
     return GapLimit(gap, pair.text, gained)
 
 
+@stored(lambda scene: scene.shape)
 def _list_other_gaps(scene: Scene) -> dict[tuple[str, int], list[Expression]]:
     """For each edge the largest gap of all others, by the end of which link; by running maxima."""
     pairs, edges, others = build_features(scene).pairs, range(scene.polygon.n_vertices), {}
@@ -217,9 +216,6 @@ def _list_other_gaps(scene: Scene) -> dict[tuple[str, int], list[Expression]]:
         inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
         others[end, finger] = [after[0], *inner, before[-1]]
     return others
-
-
-_OTHER_GAPS = Store(_list_other_gaps, lambda scene: scene.shape)
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:
@@ -236,14 +232,12 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
     Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
     the largest separation in any direction, independent of the pairs.
     """
-    return _GAPS(scene)(z)[0][..., 0]
+    return _build_gaps(scene)(z)[0][..., 0]
 
 
+@stored(lambda scene: (scene.shape, scene.fingers_collide))
 def _build_gaps(scene: Scene) -> Batch:
     features = build_features(scene)
     gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
     gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
     return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))
-
-
-_GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))

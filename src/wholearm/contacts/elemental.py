@@ -36,7 +36,7 @@ import casadi as ca
 
 from ..common.arrays import Expression
 from ..common.errors import InputError
-from ..common.sharing import Store
+from ..common.sharing import stored
 from ..scene.model import Scene
 
 _Z = ca.SX.sym("z", 5)  # of all scenes: limits that they share outlive the one that built them
@@ -160,13 +160,11 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     return contacts
 
 
-def _build_features(scene: Scene) -> Features:
+@stored(lambda scene: scene.shape)
+def build_features(scene: Scene) -> Features:
+    """The features of a scene as expressions of z, the same for scenes of one shape."""
     links = [(ca.DM(link.base), link.length, link.radius) for link in scene.fingers]
     return place_bodies(ca.DM(scene.polygon.vertices.T), links)
-
-
-build_features = Store(_build_features, lambda scene: scene.shape)
-"""The features of a scene as expressions of z, the same for scenes of one shape."""
 
 
 def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Batch, Store, exclusive
+from ..common.sharing import Batch, exclusive, stored
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
 from .elemental import Contact, GapLimit, build_features, candidate_contacts
@@ -34,6 +34,10 @@ class Kinematics(NamedTuple):
     A_t: Array
     P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
     P_dot_v: Array  # (n, n_c + R): P' v for the velocities v that were given: P z'' = -P' z'
+
+
+def _identify_limits(formation: Formation) -> Hashable:
+    return formation.scene.shape, formation.scene.fingers_collide, formation.contacts
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +121,7 @@ class Formation:
     @property
     def function(self) -> Expression:
         """CasADi function (z, v) -> (gaps and slips of what rolls [m], A, A_t, P' v)."""
-        return _FUNCTIONS(self).function
+        return _build_function(self).function
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
         """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
@@ -126,13 +130,14 @@ class Formation:
         return gaps, P, P_dot_v, A_t
 
     @property
+    @stored(_identify_limits)
     def limits(self) -> tuple[GapLimit, ...]:
         """Where this formation stops being valid, as expressions of the features' symbol z."""
-        return _LIMITS(self)
+        return tuple(list_limits(self.scene, self.contacts))
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
-        gaps, A, A_t, P_dot_v = _FUNCTIONS(self)(z, v)
+        gaps, A, A_t, P_dot_v = _build_function(self)(z, v)
         P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1) if self.rolling else A
         return Kinematics(gaps[:, : self.n_contacts, 0], A, A_t, P, P_dot_v[..., 0])
 
@@ -140,30 +145,28 @@ class Formation:
         """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""
         if not self.rolling:
             return np.zeros((len(z), 0))
-        return _FUNCTIONS(self)(z, z)[0][:, self.n_contacts :, 0]
+        return _build_function(self)(z, z)[0][:, self.n_contacts :, 0]
 
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
-        return _LIMIT_FUNCTIONS(self)(z)[0][..., 0]
+        return _build_limit_function(self)(z)[0][..., 0]
 
 
 @exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
-    candidates, function = _CLEARANCES(scene)
+    candidates, function = _build_clearances(scene)
     near = np.abs(function(z[None])[0][0, :, 0]) < scene.touching
     return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
 
 
+@stored(lambda scene: scene.shape)
 def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Batch]:
     """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
     candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
     values = ca.vertcat(*(build_clearance(c, scene, touching=False).value for c in candidates))
     function = ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
     return candidates, Batch(function)
-
-
-_CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)
 
 
 def describe(contacts: Sequence[Contact]) -> str:
@@ -186,6 +189,7 @@ def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     return tuple(ca.cse([pair.gap, A, A_t, bend, pair.slip, slip_bend]))
 
 
+@stored(lambda formation: (formation.scene.shape, formation.contacts, formation.rolling))
 def _build_function(formation: Formation) -> Batch:
     parts = [_build_part(contact, formation.scene) for contact in formation.contacts]
     rolling = [parts[row] for row in formation.rolling_rows]
@@ -199,17 +203,7 @@ def _build_function(formation: Formation) -> Batch:
     return Batch(ca.Function("formation", [build_features(formation.scene).z, _V], outputs))
 
 
+@stored(_identify_limits)
 def _build_limit_function(formation: Formation) -> Batch:
     values = ca.densify(ca.vertcat(*(limit.value for limit in formation.limits)))
     return Batch(ca.Function("limits", [build_features(formation.scene).z], [values]))
-
-
-_FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
-
-
-def _identify_limits(formation: Formation) -> Hashable:
-    return formation.scene.shape, formation.scene.fingers_collide, formation.contacts
-
-
-_LIMITS = Store(lambda f: tuple(list_limits(f.scene, f.contacts)), _identify_limits)
-_LIMIT_FUNCTIONS = Store(_build_limit_function, _identify_limits)

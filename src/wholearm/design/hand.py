@@ -64,7 +64,7 @@ def read_choices(problem: Problem, texts: Sequence[str], symmetric: bool = False
     for name, (low, high) in read_vary(texts, 1, "--over").items():
         parameter = find_parameter(problem, name, "--over")
         for end in (low, high):
-            require_allowed(problem, parameter, end, "--over")
+            require_allowed(problem, name, end, "--over")
         factors = dict.fromkeys(parameter.keys, 1.0)
         for key in parameter.keys if symmetric else ():
             other = re.sub(r"(finger(?:s\.)?)([12])", lambda m: m[1] + "21"[int(m[2]) - 1], key)

@@ -40,10 +40,6 @@ class Parameter(NamedTuple):
         """Name and unit."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
-    def set(self, problem: Problem, value: float) -> Problem:
-        """The problem with another value; raises like `Problem.with_`."""
-        return problem.with_(dict.fromkeys(self.keys, value))
-
 
 def list_parameters(problem: Problem) -> list[Parameter]:
     """Every number of a problem once, by its shortest name; none that it leaves out."""
@@ -69,13 +65,14 @@ def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
     raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(shown))
 
 
-def require_allowed(problem: Problem, parameter: Parameter, value: float, label: str) -> None:
+def require_allowed(problem: Problem, name: str, value: Any, label: str) -> None:
     """Raise an `InputError` if no file may have a value; what cannot be reached with it may be."""
     try:
-        parameter.set(problem, value)
+        problem.with_({name: value})
     except InputError as error:
-        if any(key.partition("[")[0] == error.key.partition("[")[0] for key in parameter.keys):
-            raise InputError(error.source, f"{label} {parameter.name}", error.problem) from None
+        keys = name, *name_keys().get(name, ())
+        if any(key.partition("[")[0] == error.key.partition("[")[0] for key in keys):
+            raise InputError(error.source, f"{label} {name}", error.problem) from None
 
 
 def _find_every(problem: Problem) -> dict[str, Parameter]:

@@ -348,7 +348,7 @@ def _find_one(
             if not change and len(sides) != 1:
                 continue
             try:
-                changed = each.set(problem, each.value + change * size)
+                changed = problem.with_({each.name: each.value + change * size})
                 sides.append((change * size, evaluate(changed, changed.start)[0]))
             except (WholearmError, ValueError) as error:
                 note, fault = f"{text}{error}", str(error)

@@ -33,9 +33,8 @@ from ..mechanics.limits import make_limits
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import UNITS, Plan
 from ..problem.definition import Problem
-from ..problem.read import name_keys
 from ..search import solve
-from .parameters import Parameter, find_parameter, require_allowed
+from .parameters import find_parameter, require_allowed
 
 Point = tuple[Any, ...]  # index of a problem, and the value of each parameter
 Row = dict[str, Any]  # what came of a point, as plain values; see `Sweep`
@@ -281,10 +280,9 @@ def sweep(
     axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
     for problem, (name, given) in product(listed[::-1], axes.items()):
-        parameter = Parameter(name, (name, *name_keys().get(name, ())), math.nan, "")
         numbers = all(isinstance(value, Real) for value in given)
         for value in (min(given), max(given)) if numbers else given:
-            require_allowed(problem, parameter, value, "--vary")
+            require_allowed(problem, name, value, "--vary")
         titles[name] = name
         with suppress(InputError):
             titles[name] = find_parameter(problem, name).title

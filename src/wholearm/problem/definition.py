@@ -332,27 +332,25 @@ LENGTH = 1 / 30
 """Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
 _SHARE = "Half width, relative."
 _RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
+_LENGTH = "Half width [m]."
+_RANGES = (
+    ("", "mass inertia", _SHARE, _RELATIVE, 0.05),
+    ("friction", "friction_palm friction_finger1 friction_finger2", _SHARE, _RELATIVE, 0.1),
+    ("geometry", "length1 length2 base1_x base1_y base2_x base2_y", _LENGTH, NONNEGATIVE, 6e-3),
+    ("", "start_x", _LENGTH, NONNEGATIVE, 6e-3),
+    ("gain", "gain1 gain2", _SHARE, _RELATIVE, 0.01),
+    ("", "delay", "Half width [s].", NONNEGATIVE, 1e-3),
+)
 PARAMETERS = tuple(
     key(name, text, kind, default=width)
-    for text, kind, names, width in (
-        (_SHARE, _RELATIVE, "mass inertia", 0.05),
-        (_SHARE, _RELATIVE, "friction_palm friction_finger1 friction_finger2", 0.1),
-        ("Half width [m].", NONNEGATIVE, "length1 length2 base1_x base1_y base2_x base2_y", 6e-3),
-        ("Half width [m].", NONNEGATIVE, "start_x", 6e-3),
-        (_SHARE, _RELATIVE, "gain1 gain2", 0.01),
-        ("Half width [s].", NONNEGATIVE, "delay", 1e-3),
-    )
+    for _, names, text, kind, width in _RANGES
     for name in names.split()
 )
 """All that can be varied; defaults of lengths are over the scene's length. A delay is never
 negative: its range is [0, half width]."""
 
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "friction": ("friction_palm", "friction_finger1", "friction_finger2"),
-    "geometry": ("length1", "length2", "base1_x", "base1_y", "base2_x", "base2_y"),
-    "gain": ("gain1", "gain2"),
-}
+GROUPS = {group: tuple(names.split()) for group, names, *_ in _RANGES if group}
 """Names that stand for several."""
 
 

@@ -98,17 +98,11 @@ _FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle", 
 
 
 def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
-    """Check that the plan with this `meta` was made for a problem.
-
-    InputError if it was not, by the first key that differs, or does not say what it was made for.
-    """
-    tables = meta.get("problem")
-    if not isinstance(tables, Mapping):
+    """Check that the plan with this `meta` was made for a problem, and says so."""
+    if not isinstance(meta.get("problem"), Mapping):
         raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
-    difference = next(_find(tables, problem), None)
-    if difference is not None:
-        text = f"{difference.one} in the trajectory, {difference.other} in the problem"
-        raise InputError("", difference.key, f"{text}; it is one of another problem")
+    if origin := describe_origin(problem, meta, "trajectory"):
+        raise InputError("", "", origin)
 
 
 def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan") -> str:

@@ -13,7 +13,7 @@ from typing import TextIO
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, require_number
+from ..common.errors import InputError, name_file, require_number
 from ..common.fields import choice
 
 ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
@@ -176,10 +176,8 @@ def read_notes(path: str) -> dict[str, str]:
 def _open(path: str) -> Iterator[TextIO]:
     """A CSV file; what is wrong with it is an `InputError`."""
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
+        with name_file(path), open(path, newline="", encoding="utf-8-sig") as stream:
             yield stream
-    except OSError as error:
-        raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(str(path), "", f"is not CSV: {error}") from None
 

@@ -303,13 +303,12 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 
 def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
     array = arrays[name]
-    rows = arrays["t"].size if name in _ARRAYS else array.shape[0] if array.ndim else 1
-    widths = (arrays["contacts"].size,) if name in ("c_n", "c_t") else tail
-    fits = array.ndim == 1 + len(widths) and array.shape[0] == rows
-    fits = fits and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
-    if not fits:
-        needed = ", ".join(str(n) if n >= 0 else "any" for n in (rows, *widths))
-        raise InputError(source, name, f"shape {array.shape} given, ({needed}) needed")
+    rows = arrays["t"].size if name in _ARRAYS else -1
+    needed = rows, *((arrays["contacts"].size,) if name in ("c_n", "c_t") else tail)
+    pairs = zip(needed, array.shape, strict=False)
+    if array.ndim != len(needed) or not all(size in (-1, n) for size, n in pairs):
+        text = ", ".join(str(n) if n >= 0 else "any" for n in needed)
+        raise InputError(source, name, f"shape {array.shape} given, ({text}) needed")
     if name == "contacts":
         if array.dtype.kind != "U":
             raise InputError(source, name, "does not hold text")

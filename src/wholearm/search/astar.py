@@ -71,7 +71,7 @@ class Heuristic(NamedTuple):
     most: int  # most places that are expanded
 
 
-EAGER = Heuristic(14.0, 4.0, 130)
+EAGER: Heuristic = Heuristic(14.0, 4.0, 130)
 """As routes through cells take: greedy, leads to a first plan soon."""
 CAREFUL = Heuristic(4.0, 2.5, 50)
 """Hardly any route takes less: finds routes that start in the wrong direction.
@@ -419,8 +419,7 @@ class RoutePlanner:
         if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
             tasks.append(partial(bound_borders, self.search, enough))
-        begun = sorted(range(len(tasks)), key=lambda k: k < len(new) and along[new[k]])
-        results = self._share(tasks, begun)
+        results = share(tasks, self.jobs)
         for bound in results[len(new) :]:
             self._bound = enough, bound
         known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
@@ -470,7 +469,7 @@ class RoutePlanner:
             report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
         plan = partial(plan_coarsely, self.problem, options=self.options, further=True)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
-        for edge, coarse in zip(new, self._share(tasks), strict=True):
+        for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
         return all(plans[edge] for edge in in_cells)
 
@@ -489,14 +488,11 @@ class RoutePlanner:
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            made = self._share([partial(search.args[0], path, None) for path in paths])
+            made = share([partial(search.args[0], path, None) for path in paths], self.jobs)
             searches[edge] = partial(search, known=dict(zip(paths, made, strict=True)))
-        results = self._share(list(searches.values()))
+        results = share(list(searches.values()), self.jobs)
         for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
-
-    def _share(self, tasks: Sequence[Task[T]], order: Sequence[int] = ()) -> list[T]:
-        return share(tasks, self.jobs, (self.problem, self.problem.scene), order)
 
     def _release(
         self, edge: Edge, path: RefinedPath, stopped: CoarsePlan | None

@@ -26,7 +26,6 @@ from .. import __version__
 from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError
 from ..common.files import make_folder, write_whole
-from ..common.parallel import pickle_deep
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..planning.options import Objective, PlanOptions
@@ -239,7 +238,7 @@ def load_roadmap(folder: Path, key: str) -> Roadmap | None:
 
 def store_roadmap(folder: Path, key: str, roadmap: Roadmap) -> None:
     """Write the roadmap of a scene in place of the one before."""
-    body = pickle_deep(roadmap)
+    body = pickle.dumps(roadmap, pickle.HIGHEST_PROTOCOL)
     if len(body) <= LARGEST:
         digest = hashlib.sha256(body).digest()
         write_whole(_name_file(folder, key), lambda stream: stream.write(digest + body))

@@ -24,7 +24,7 @@ from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import load
-from ..mapping.formation_map import Border, FormationMap, build_map, choose_window, time_borders
+from ..mapping.formation_map import Border, FormationMap, build_map, time_borders
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..search import solve
@@ -38,13 +38,12 @@ def build_report(
     paths: Sequence[str],
     text: str = "",
     progress: Callable[[str], None] = lambda text: None,
-    chart: FormationMap | None = None,
     sensitivities: bool = False,
 ) -> str:
     """Put the plans (.npz) and torques (.csv) at `paths`, replayed, into one page of HTML.
 
-    It has the `text` of the problem file, a map, `chart` if it is there already, and, with
-    `sensitivities`, what 1 % more of each number is worth.
+    It has the `text` of the problem file, a map, and, with `sensitivities`, what 1 % more of each
+    number is worth.
 
     InputError if a file cannot be read, or is one of another problem; names the file.
     """
@@ -65,7 +64,7 @@ def build_report(
         parts += ["<h2>What 1 % more of each number is worth</h2>"]
         parts += [write_svg(draw_sensitivities(result)), result.document.to_html()]
     progress("map")
-    chart = chart or build_map(problem, 90, choose_window(problem, None))
+    chart = build_map(problem, 90)
     machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
         "<h2>Contact formations</h2>",

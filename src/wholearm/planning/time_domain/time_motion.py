@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.sharing import Batch, Store
+from ...common.sharing import Batch, stored
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import (
@@ -27,10 +27,12 @@ from ...results.trajectory import Samples
 from .stage import Scheme, Stage, StagePoints, blend
 
 _NODES = 8  # places per interval at which the equations of motion are solved
-# Forward dynamics of formations.
-_FORWARDS = Store(
-    lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
-)
+
+
+@stored(lambda formation: formation.equations)
+def _compile_forward(formation: Formation) -> Batch:
+    """Forward dynamics of a formation."""
+    return Batch(build_forward(formation))
 
 
 class MotionResponse(NamedTuple):
@@ -108,7 +110,7 @@ class StageMotion:
                 np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
                 for part in (place, velocity)
             )
-            forces = _FORWARDS(self.formation)(*state, tau.reshape(-1, 2), *signs)
+            forces = _compile_forward(self.formation)(*state, tau.reshape(-1, 2), *signs)
             accelerations = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
             residual = np.abs(weights * (accelerations - a)).max(axis=(1, 2), keepdims=True)
             nearer = residual < least
@@ -146,7 +148,7 @@ class StageMotion:
         v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
         Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
-        a, c, _ = _FORWARDS(self.formation)(z, v, tau, Xi, sigma)
+        a, c, _ = _compile_forward(self.formation)(z, v, tau, Xi, sigma)
         c_n, c_t = split_forces(formation, c[..., 0], Xi)
         return Samples(z, v, a[..., 0], tau, c_n, c_t)
 
@@ -155,7 +157,7 @@ class StageMotion:
         at = self.evaluate(t)
         signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
         responses = [
-            _FORWARDS(self.formation)(at.z, at.z_dot, at.tau + step, *signs)[:2]
+            _compile_forward(self.formation)(at.z, at.z_dot, at.tau + step, *signs)[:2]
             for step in (np.zeros(2), *np.eye(2))
         ]
         a, c = (
