@@ -38,7 +38,7 @@ from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
-from wholearm.search import cuts, edge_plans
+from wholearm.search import astar, cuts, edge_plans
 from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
 from wholearm.search.astar import Route as SearchRoute
 from wholearm.search.edges import Edge
@@ -288,8 +288,24 @@ def test_edges_that_cannot_be_planned_are_named() -> None:
     problem = problem_of(HEPTAGON).with_(torque_limit=0.02)
     edges = [(edge, None) for edge in edge_plans.split_route(route.edges)[0]]
     lost = edge_plans.plan_part(problem, edges, OPTIONS, lambda _: None)
-    assert isinstance(lost, edge_plans.Lost) and lost.edges == (route.edges[0],)
+    assert isinstance(lost, edge_plans.Lost) and lost.phases == [1]
     assert "until" in lost and "phase 1" in lost
+
+
+@pytest.mark.parametrize(("phases", "lost", "tries"), [([2], slice(1, 2), 1), ([], slice(0), 2)])
+def test_edges_of_phases_without_a_plan_are_left_out_of_other_routes(
+    phases: list[int], lost: slice, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a failure without known phases other guesses and routes of the same edges are tried."""
+    own, route = to_edge_6()
+    failed = edge_plans.Lost("no plan")
+    failed.phases, plan = phases, Mock(return_value=failed)
+    monkeypatch.setattr(astar, "plan_phases", plan)
+    monkeypatch.setattr(astar.RoutePlanner, "_plan_parts", Mock(return_value=[]))
+    planner = astar.RoutePlanner(problem_of(HEPTAGON), None, own, OPTIONS, found=[route, route])
+    planner.plan(1, lambda _: None)
+    assert not planner.made and planner.failures == ["no plan"] * tries
+    assert failed.edges == route.edges[lost] and plan.call_count == tries**2
 
 
 @pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])

@@ -321,7 +321,7 @@ class RoutePlanner:
             self.found.remove(route)
             if isinstance(plan, str):
                 self.failures.append(plan)
-                if isinstance(plan, Lost):
+                if isinstance(plan, Lost) and plan.edges:
                     self._lost.append(plan.edges)
             else:
                 self.made.append((plan, route))
@@ -369,15 +369,20 @@ class RoutePlanner:
                 best = plan
             if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
                 break
-            if isinstance(plan, Lost) and plan.phases and alike:
-                # Without its guess a phase was tried, too. Case: query 62, four of whose routes go
-                # through phases 18 and 19 of the first one.
-                plan.edges = self._find_lost(route, [k - len(before) for k in plan.phases])
-                break
+            if isinstance(plan, Lost) and alike:
+                numbers = [k - len(before) for k in plan.phases if k > len(before)]
+                if numbers:
+                    # Without its guess a phase was tried, too. Case: query 62, four of whose routes
+                    # go through phases 18 and 19 of the first one.
+                    plan.edges = self._find_lost(route, numbers)
+                    break
         return best
 
     def _find_lost(self, route: Route, phases: Sequence[int]) -> tuple[Edge, ...]:
-        """Edges that phases of a route belong to, after the one that lands at their start."""
+        """Edges of a route that phases without a plan belong to.
+
+        The one that lands at their start, which may have landed at another place, is before them.
+        """
         coarse, owners = self.roadmap.coarse_plans, list[int]()
         for k, edge in enumerate(route.edges):
             owners += [k] * len((coarse[edge][0] if edge.in_cell else edge).steps)
@@ -425,6 +430,8 @@ class RoutePlanner:
         known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
         for k in order:
             if isinstance(made := known.get(keys[k]), Lost):
+                passed = sum(len((plan or edge).steps) for part in parts[:k] for edge, plan in part)
+                made.edges = self._find_lost(route, [passed + number for number in made.phases])
                 return made
         # None is lost, and so all are planned.
         return [cast(PartPlan, known[key]) for key in keys]

@@ -137,11 +137,10 @@ def plan_coarsely(
 
 
 class Lost(str):
-    """Why a route has no plan, with the edges for which that is so on every route."""
+    """Why a route or a part of it has no plan."""
 
-    # the one whose planning fails, after the one that lands at its start, if any
-    edges: tuple[Edge, ...] = ()
-    phases: Sequence[int] = ()  # numbers of the phases that have no plan, where that is known
+    phases: Sequence[int] = ()  # numbers of its phases that have none, where that is known
+    edges: tuple[Edge, ...] = ()  # those of the route for which that is so on every route
 
 
 def plan_phases(
@@ -262,9 +261,7 @@ def plan_part(
         tried = [step for step, owner in zip(steps, owners, strict=True) if owner <= failed]
         reason = str(error) if isinstance(error, WholearmError) else DEPENDENT
         lost = Lost(f"{describe_steps(tried)}: {reason}")
-        # The edge that lands where the culprit starts may have landed at another place.
-        first = failed - (failed > 0 and edges[failed - 1][0].in_cell)
-        lost.edges = tuple(edge for edge, _ in edges[first : failed + 1])
+        lost.phases = [len(phases) + 1]
         return lost
     return PartPlan(duration, phases)
 
