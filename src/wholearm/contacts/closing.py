@@ -79,9 +79,7 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
 
 def close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
-    if len(x) <= CHUNK:
-        return _close_fingers(scene, x, phi)
-    cuts = range(0, len(x), CHUNK)
+    cuts = range(0, max(len(x), 1), CHUNK)
     parts = [_close_fingers(scene, x[k : k + CHUNK], phi[k : k + CHUNK]) for k in cuts]
     return ClosedFinger(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
