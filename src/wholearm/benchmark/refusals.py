@@ -38,7 +38,7 @@ from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_ar
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
 from ..mechanics import UNIQUENESS
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import metric_weights, null_vector
 from ..planning.plan import solve
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
@@ -102,12 +102,8 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     near = OVERLAP * size
 
     def tangents(z: Array) -> Array:
-        # Cofactors of the four rows: unlike null vectors of an SVD they keep their sense.
-        rows = constrain(scene, phase, z)[1] / scale
-        minors = [way * (-1) ** k * np.linalg.det(np.delete(rows, k, axis=2)) for k in range(5)]
-        tangent = np.stack(minors, axis=1)
-        size = np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
-        return np.asarray(tangent / size / scale)
+        # By minors: unlike null vectors of an SVD they keep their sense.
+        return np.asarray(way * null_vector(constrain(scene, phase, z)[1] / scale) / scale)
 
     def overlap(_: float, z: Array) -> float:
         return float(min(room[0] for room in find_room(scene, phase, z[None]).values())) + near
