@@ -36,7 +36,7 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
     """
     touches = [locate(scene, name, z[None]) for name in phase.formation.names]
     rolling = phase.formation.rolling_rows
-    closed = constrain(scene, phase, z[None])[1][0]
+    closed = constrain(phase.formation, z[None])[1][0]
     size = np.array([1.0, 1.0, *[1 / scene.scales.length] * 3])
     N = size[:, None] * null_space(closed * size, rcond=STILL)
     if N.shape[1] not in (1, 2):

@@ -57,16 +57,16 @@ def road_of(path: Path, index: int = 0) -> slow_speeds.PathSamples:
         road = slow_speeds.sample_path(phase, z, problem.phases[phase.index + 1 :])
         assert road is not None
         roads.append(road)
-        z = road.z[-1]
+        z = road.point.z[-1]
     return roads[-1]
 
 
 def find_least_by_lp(road: slow_speeds.PathSamples, row: int, a: float, b: float) -> float:
     """The largest epsilon at one place, by a linear programme in forces and torques."""
     formation, scene = road.phase.formation, road.phase.formation.scene
-    G = force_rows(formation, road.kinematics, road.directions)[row]
-    v, n = math.sqrt(b) * road.z_s[row], len(G)
-    inertia = scene.mass_diagonal * (road.z_s[row] * a + road.z_ss[row] * b)
+    G = force_rows(formation, road.point.kinematics, road.directions)[row]
+    v, n = math.sqrt(b) * road.point.z_s[row], len(G)
+    inertia = scene.mass_diagonal * (road.point.z_s[row] * a + road.point.z_ss[row] * b)
     load = inertia + scene.viscous * v - scene.applied_force
     load[3:] += scene.dry[3:] * road.directions.sigma[row]
     H = force_limit_rows(formation)
@@ -153,17 +153,17 @@ def test_the_straight_line_keeps_its_contacts_and_newtons_laws() -> None:
     road = slow_speeds.sample_path(problem.phases[0], problem.start, ())
     assert road is not None and road.curve is None
     formation, scene = road.phase.formation, problem.scene
-    assert np.abs(road.kinematics.C).max() < 1e-12
-    x, phi = road.z[:, 0], road.z[:, 2]
+    assert np.abs(road.point.kinematics.C).max() < 1e-12
+    x, phi = road.point.z[:, 0], road.point.z[:, 2]
     assert np.ptp((x - x[0]) * (phi[-1] - phi[0]) - (phi - phi[0]) * (x[-1] - x[0])) < 1e-12
-    for function, slope in ((road.z, road.z_s), (road.z_s, road.z_ss)):
+    for function, slope in ((road.point.z, road.point.z_s), (road.point.z_s, road.point.z_ss)):
         quotient = (function[2:] - function[:-2]) / (road.s[2:] - road.s[:-2])[:, None]
         assert quotient[20:-20] == pytest.approx(slope[21:-21], rel=2e-2, abs=1e-2)
     a, b = np.full(len(x), 2.0), np.full(len(x), 0.3)
     c, tau = road.forces.c(a, b, 0 * a), road.forces.tau(a, b, 0 * a)
-    G = force_rows(formation, road.kinematics, road.directions)
-    inertia = scene.mass_diagonal * (road.z_s * a[:, None] + road.z_ss * b[:, None])
-    rest = inertia + scene.viscous * road.z_s * math.sqrt(0.3) - scene.applied_force
+    G = force_rows(formation, road.point.kinematics, road.directions)
+    inertia = scene.mass_diagonal * (road.point.z_s * a[:, None] + road.point.z_ss * b[:, None])
+    rest = inertia + scene.viscous * road.point.z_s * math.sqrt(0.3) - scene.applied_force
     rest -= np.einsum("nij,ni->nj", G, c)
     rest[:, 3:] += scene.dry[3:] * road.directions.sigma - tau
     assert np.abs(rest).max() < 1e-10

@@ -12,7 +12,7 @@ import pytest
 from rows import each
 from shipped import HEPTAGON, tipping
 from toys import plan_path
-from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
+from wholearm import Friction, Phase, PlanOptions, Problem, Trajectory, load
 from wholearm.benchmark import refusals
 from wholearm.benchmark.damage import look, run_file
 from wholearm.benchmark.scenes import draw_case, random_scene
@@ -72,9 +72,9 @@ def test_values_that_noise_changes_are_found() -> None:
     assert name == "a.toml, time"
 
 
-def reach(scene: Scene, phase: Phase, start: Array) -> refusals.Trace:
+def reach(phase: Phase, start: Array) -> refusals.Trace:
     """The way from there that reaches the end of a phase."""
-    (reached,) = (way for way in refusals.follow(scene, phase, start) if way.reached)
+    (reached,) = (way for way in refusals.follow(phase, start) if way.reached)
     return reached
 
 
@@ -83,7 +83,7 @@ def test_small_steps_end_where_the_curve_does(
     heptagon: Problem, curves: tuple[Curve, ...], index: int
 ) -> None:
     phase = heptagon.phases[index]
-    ways = refusals.follow(heptagon.scene, phase, curves[index].start)
+    ways = refusals.follow(phase, curves[index].start)
     (reached,) = (way for way in ways if way.reached)
     assert np.abs(reached.end - curves[index].end).max() < 1e-5
     assert {way.ending for way in ways if not way.reached} <= {
@@ -96,7 +96,7 @@ def test_small_steps_end_where_the_curve_does(
 def test_rolling_keeps_its_place() -> None:
     problem = load(str(HEPTAGON.with_name("box_rolling.toml")))
     first, second = trace_phases(problem)[:2]
-    reached = reach(problem.scene, problem.phases[1], first.end)
+    reached = reach(problem.phases[1], first.end)
     assert np.abs(reached.end - second.end).max() < 1e-4
 
 
@@ -104,13 +104,13 @@ def test_places_where_a_contact_turns_are_on_the_grid(
     heptagon: Problem, curves: tuple[Curve, ...]
 ) -> None:
     phase, curve = heptagon.phases[2], curves[2]
-    reached = reach(heptagon.scene, phase, curve.start)
-    s, z, z_s = refusals.resample(heptagon.scene, phase, reached, 20)
+    reached = reach(phase, curve.start)
+    s, z, z_s = refusals.resample(phase.formation, reached, 20)
     turns = [part.start for part in curve.segments[1:]]
     assert turns, "this phase is here for its reversal"
     for turn in turns:
         assert np.abs(s - turn).min() < 1e-3 * curve.length
-    rates = refusals.slides(heptagon.scene, phase, z, z_s)
+    rates = refusals.slides(phase.formation, z, z_s)
     assert (np.abs(rates[s == s[np.abs(s - turns[0]).argmin()]]).min()) < 1e-4
 
 
@@ -120,17 +120,15 @@ Course = tuple[Array, Array, Array]
 @pytest.fixture(scope="module")
 def course(heptagon: Problem, curves: tuple[Curve, ...]) -> tuple[Phase, Course]:
     phase = heptagon.phases[2]
-    return phase, refusals.resample(
-        heptagon.scene, phase, reach(heptagon.scene, phase, curves[2].start), 12
-    )
+    return phase, refusals.resample(phase.formation, reach(phase, curves[2].start), 12)
 
 
 def test_where_a_plan_exists_a_motion_keeps_the_limits(
     heptagon: Problem, course: tuple[Phase, Course]
 ) -> None:
     phase, (s, z, z_s) = course
-    slow = refusals.slow_margin(heptagon.scene, phase, heptagon.epsilon, z, z_s)
-    fast = refusals.fast_margin(heptagon.scene, phase, heptagon.epsilon, (s, z, z_s))
+    slow = refusals.slow_margin(phase.formation, heptagon.epsilon, z, z_s)
+    fast = refusals.fast_margin(phase.formation, heptagon.epsilon, (s, z, z_s))
     assert 0.0 < slow <= fast + 1e-9
 
 
@@ -141,8 +139,8 @@ def test_planner_and_linear_programme_agree_on_the_weakest_hand(
     phase, (s, z, z_s) = course
     plan = plan_path(curves[2], heptagon.epsilon, PlanOptions(intervals=20), phase.number)
     peak = float(np.abs(plan.motion.evaluate(plan.motion.times).tau).max())
-    scene = heptagon.with_(torque_limit=1.001 * peak).scene
-    assert refusals.fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) >= -1e-9
+    weak = heptagon.with_(torque_limit=1.001 * peak).phases[2].formation
+    assert refusals.fast_margin(weak, heptagon.epsilon, (s, z, z_s)) >= -1e-9
 
 
 def test_least_minors_are_those_of_the_planner(
@@ -151,7 +149,7 @@ def test_least_minors_are_those_of_the_planner(
     phase, (_, z, z_s) = course
     rough = replace(heptagon.scene, friction=Friction(0.6, 0.9, 0.9))
     formation = replace(phase.formation, scene=rough)
-    ratios = refusals.uniqueness_ratio(rough, replace(phase, formation=formation), z, z_s)
+    ratios = refusals.uniqueness_ratio(formation, z, z_s)
     part = curves[2].segments[0]
     minors = find_minors(formation, formation.evaluate(z[:1], z_s[:1]), part.Xi)
     assert ratios[0] == pytest.approx(minors.ratios[0], rel=1e-9)
@@ -161,7 +159,7 @@ def _ends() -> Array:
     problem = tipping()
     start = problem.start
     stop = float(start[0]), float(start[2]) + 0.2
-    return refusals.list_ends(problem.scene, problem.phases[0], start, stop)
+    return refusals.list_ends(problem.phases[0], start, stop)
 
 
 def test_ends_are_where_the_phase_ends() -> None:
@@ -171,7 +169,7 @@ def test_ends_are_where_the_phase_ends() -> None:
     assert np.abs(phase.formation.evaluate(ends, ends).C).max() < 1e-9
     goal = ends[3]
     pinned = replace(phase, until=replace(phase.until, pins=(("x", float(goal[0])),)))
-    (place,) = refusals.list_ends(tipping().scene, pinned, tipping().start, (goal[0], goal[2]))
+    (place,) = refusals.list_ends(pinned, tipping().start, (goal[0], goal[2]))
     assert place == pytest.approx(goal, abs=1e-9)
 
 
@@ -186,19 +184,19 @@ def test_ends_are_found_though_a_joint_turns_far_on_the_way() -> None:
     ]
     problem = build_problem({**table, "phases": phases})
     start, stop = trace_phases(problem)[1].end, (0.02953, -0.22767)
-    ends = refusals.list_ends(problem.scene, problem.phases[2], start, stop)
+    ends = refusals.list_ends(problem.phases[2], start, stop)
     assert len(ends) > 5 and np.abs(ends[0, [0, 2]] - stop).max() < 1e-3
     assert ends[0, 3] - start[3] > 1.3
 
 
 def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
     problem = tipping()
-    (phase,), scene = problem.phases, problem.scene
-    margin, z, curves = refusals.find_best(scene, phase, problem.epsilon, problem.start, _ends())
+    (formation,) = (phase.formation for phase in problem.phases)
+    margin, z, curves = refusals.find_best(formation, problem.epsilon, problem.start, _ends())
     assert margin > 1e-3 and curves > 0
-    assert np.abs(phase.formation.evaluate(z, z).C).max() < 1e-9
+    assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
     assert np.degrees(z[-1, 2]) == pytest.approx(9.5, abs=1e-6)
-    assert refusals.slow_margin(scene, phase, problem.epsilon, z, np.gradient(z, axis=0)) > 0
+    assert refusals.slow_margin(formation, problem.epsilon, z, np.gradient(z, axis=0)) > 0
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -29,7 +29,7 @@ from wholearm.planning.plan import solve
 from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import Balance, balance
-from wholearm.verification.verdict import STRAY, Allowance, find_least_force, measure_stray
+from wholearm.verification.verdict import STRAY, Allowance, measure_stray
 from wholearm.verification.verify import list_normal_forces, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
@@ -603,5 +603,5 @@ def test_a_contact_that_is_let_go_counts_until_then() -> None:
     assert phase.until == "release of v3-finger1"
     margins = {margin.contact: margin for margin in phase.contacts}
     assert margins["v3-finger1"].least > problem.epsilon - measure_stray(problem)
-    assert find_least_force(phase) == min(phase.contacts, key=lambda margin: margin.least)
-    assert find_least_force(phase._replace(contacts=())) is None
+    assert phase.least_force == min(phase.contacts, key=lambda margin: margin.least)
+    assert phase._replace(contacts=()).least_force is None

@@ -20,7 +20,6 @@ from ..results.adopt import require_made_for
 from ..results.report import Report
 from ..results.torque import read_notes, read_torque_csv
 from ..results.trajectory import Trajectory, load_trajectory
-from ..verification.verdict import find_least_force
 from ..verification.verify import verify
 
 SIMULATIONS = "simulations"
@@ -162,12 +161,7 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         report = verify(problem, planned or torque)
     except (JammingError, SimulationError) as error:
         return replace(contender, reason=str(error))
-    forces = [(find_least_force(phase), phase.number) for phase in report.phases]
-    least, number = min(
-        ((force, number) for force, number in forces if force is not None),
-        key=lambda pair: pair[0].least,
-        default=(None, 0),
-    )
+    least, number = report.least_force
     energy, end = report.energy, report.phases[-1].arrival
     return replace(
         contender,
@@ -182,6 +176,9 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
             math.nan if phase.arrival is None else phase.arrival - phase.start
             for phase in report.phases
         ),
-        margins=tuple(math.nan if force is None else force.margin for force, _ in forces),
+        margins=tuple(
+            math.nan if force is None else force.margin
+            for force in (phase.least_force for phase in report.phases)
+        ),
         report=report,
     )

@@ -19,8 +19,8 @@ from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
-from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import Curve, border, describe_pose, directions_of, solve_tangent
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, CurvePoint, border, describe_pose, directions_of, solve_tangent
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
@@ -84,7 +84,7 @@ def predict(
             path = sample_path(phase, z, later)
             rests = not moving, phase.end is End.REST
             predictions.append(_predict_phase(problem, phase, path, rests, share))
-            z = find_end(phase, z, later) if path is None else path.z[-1]
+            z = find_end(phase, z, later) if path is None else path.point.z[-1]
             moving = phase.end is not End.REST
     return Prediction(problem.name, problem.epsilon, tuple(predictions))
 
@@ -184,7 +184,7 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
     internal = np.where(size > 0, middle, 0.0)
     c = forces.c(zero, zero, internal)
     c_n, _ = split_forces(path.phase.formation, c, path.directions.Xi)
-    return QuasistaticTorques(path.s, path.z, forces.tau(zero, zero, internal), c_n)
+    return QuasistaticTorques(path.s, path.point.z, forces.tau(zero, zero, internal), c_n)
 
 
 def _name(path: PathSamples, least: Least) -> Weakest:
@@ -199,7 +199,7 @@ def _name(path: PathSamples, least: Least) -> Weakest:
 
 
 def _place(path: PathSamples, row: int) -> Place:
-    return Place(float(path.s[row]), float(path.z[row, 0]), float(path.z[row, 2]))
+    return Place(float(path.s[row]), float(path.point.z[row, 0]), float(path.point.z[row, 2]))
 
 
 class Least(NamedTuple):
@@ -244,7 +244,7 @@ def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     slack = 1e-9 * limits.scales[others]
 
     def evaluate(speed: float) -> Least:
-        rates = speed * path.z_s[:, 3:]
+        rates = speed * path.point.z_s[:, 3:]
         values = path.press_under(tau, speed) @ of_c.T + tau @ of_tau.T + rates @ of_rates.T
         force, rest = values[:, soft] / weights, values[:, others]
         over = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
@@ -298,13 +298,10 @@ class PathSamples:
     # (n,) [m]: arc lengths in the metric of curves; where a direction reverses a place is there
     # twice
     s: Array
-    z: Array  # z, z_s, z_ss (n, 5):
-    z_s: Array
-    z_ss: Array
+    point: CurvePoint
     directions: Directions  # one row for each place
     forces: PathForces
     force_limits: InternalForceLimits
-    kinematics: Kinematics  # of the formation, for the velocity z_s
     # (n,): reduced inertia over that without friction: motions jam at zero and below
     inertia: Array
 
@@ -319,9 +316,9 @@ class PathSamples:
         Whatever acceleration these give: K c = -P' z' - P M5^-1 (g + S tau - b).
         """
         scene = self.phase.formation.scene
-        at, inverse_mass = self.kinematics, 1 / scene.mass_diagonal
+        at, inverse_mass = self.point.kinematics, 1 / scene.mass_diagonal
         G = force_rows(self.phase.formation, at, self.directions)
-        load = scene.applied_force - speed * scene.viscous * self.z_s
+        load = scene.applied_force - speed * scene.viscous * self.point.z_s
         load[:, 3:] += tau - scene.dry[3:] * self.directions.sigma
         drop = at.P * inverse_mass
         right = -(speed**2) * at.P_dot_v - np.einsum("nij,nj->ni", drop, load)
@@ -347,25 +344,21 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         starts = np.array([part.start for part in curve.segments])
         s = starts[owners] + np.concatenate(shares) * np.array(sizes)[owners]
         point = curve.evaluate(s)
-        (places, z_s, z_ss), kinematics = point[:3], point.kinematics
         directions = directions_of(curve, owners)
     elif formation.n_constraints == 3 and count_freedoms(formation, z) == 2:
         goal = guess_phase(phase, z, later)[-1].z[-1]
-        s, places, z_s, z_ss, kinematics = _straighten(formation, z, goal)
-        directions = Directions.of(kinematics, z_s)
+        s, point = _straighten(formation, z, goal)
+        directions = Directions.of(point.kinematics, point.z_s)
     else:
         return None
-    forces = inverse(formation, places, z_s, z_ss, directions, kinematics)
-    limits = InternalForceLimits.of(formation, forces, z_s[:, 3:])
-    inertia = reduced_inertia(formation, kinematics, directions)
-    line = s, places, z_s, z_ss
-    return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
+    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
+    inertia = reduced_inertia(formation, point.kinematics, directions)
+    return PathSamples(phase, curve, s, point, directions, forces, limits, inertia)
 
 
-def _straighten(
-    formation: Formation, start: Array, goal: Array
-) -> tuple[Array, Array, Array, Array, Kinematics]:
-    """Arc lengths, z, z_s and z_ss along a straight line in (x, phi), and the formation there."""
+def _straighten(formation: Formation, start: Array, goal: Array) -> tuple[Array, CurvePoint]:
+    """Arc lengths of places along a straight line in (x, phi), and the path there."""
     u = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
     way = goal - start
     line, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
@@ -379,7 +372,7 @@ def _straighten(
         at = formation.evaluate(z, z_s)
     speed = along @ along / (z_s @ along)
     s = np.append(0.0, np.cumsum(np.diff(u) * (speed[1:] + speed[:-1]) / 2))
-    return s, z, z_s, z_ss, at
+    return s, CurvePoint(z, z_s, z_ss, at)
 
 
 class Place(NamedTuple):

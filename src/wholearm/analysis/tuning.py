@@ -389,12 +389,12 @@ class PassageTuner:
             if path is None:
                 return None
             paths.append(path)
-            z = path.z[-1]
+            z = path.point.z[-1]
         ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
         path, left = paths[k], ends[k] - ends[-1] / 2
-        middle = path.z[int(np.searchsorted(path.s, path.length - left))]
-        way = abs(middle - path.z[0])
+        middle = path.point.z[int(np.searchsorted(path.s, path.length - left))]
+        way = abs(middle - path.point.z[0])
         turns = way[2] * self.problem.scene.scales.length > way[0]
         name, value = ("phi", middle[2]) if turns else ("x", middle[0])
         until = Until(coordinate=name, value=float(value))
@@ -506,8 +506,8 @@ class PassageTuner:
             if path is None or torques is None:
                 break
             tau.append(torques.tau)
-            work.append(torques.tau * path.z_s[:, 3:])
-            z = path.z[-1]
+            work.append(torques.tau * path.point.z_s[:, 3:])
+            z = path.point.z[-1]
         if not tau:
             return None
         return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())

@@ -44,7 +44,6 @@ from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
 from ..simulation.stepper import NODES
-from ..verification.verdict import find_least_force
 from .damage import BASE, STRANGE, change_tree, damage_torques
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
@@ -171,7 +170,6 @@ def _describe_plan(plan: Plan) -> Row:
 def _verify(problem: Problem, what: Any) -> Row:
     """The verdict about a plan or torques, and what the replay shows."""
     report = wholearm.verify(problem, what)
-    margins = filter(None, map(find_least_force, report.phases))
     energy = report.energy
     return {
         "ok": report.ok,
@@ -179,7 +177,7 @@ def _verify(problem: Problem, what: Any) -> Row:
         "failed phase": report.failed_phase,
         "failures": [mask(text) for text in report.failures],
         "arrivals": [phase.arrival for phase in report.phases],
-        "least": [margin.least for margin in margins],
+        "least": [one.least for phase in report.phases if (one := phase.least_force)],
         "events": [change.time for change in report.changes],
         "kinds": [f"{change.phase} {change.what} {change.kind}" for change in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],

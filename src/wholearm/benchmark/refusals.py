@@ -37,8 +37,9 @@ from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_ar
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
+from ..contacts.formation import Formation
 from ..mechanics import UNIQUENESS
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import metric_weights, null_vector
 from ..planning.plan import solve
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
@@ -59,17 +60,17 @@ class Trace(NamedTuple):
     reached: bool  # whether that is the phase's `until`
 
 
-def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
+def follow(phase: Phase, z: Array) -> tuple[Trace, Trace]:
     """Follow a phase's contacts from `z`, shape (5,), both ways."""
 
     def equations(z: Array) -> tuple[Array, Array]:
-        gaps, rows = constrain(scene, phase, z[None])
+        gaps, rows = constrain(phase.formation, z[None])
         return gaps[0], rows[0, : gaps.shape[1]]
 
     # The phase before ends where bodies overlap by `OVERLAP`.
-    closed = project(scene, z, equations)
+    closed = project(phase.formation.scene, z, equations)
     z = z if closed is None else closed
-    return _march(scene, phase, z, 1.0), _march(scene, phase, z, -1.0)
+    return _march(phase, z, 1.0), _march(phase, z, -1.0)
 
 
 def project(
@@ -89,28 +90,25 @@ def project(
     return z if np.abs(equations(z)[0]).max() < 1e-9 * size else None
 
 
-def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+def constrain(formation: Formation, z: Array) -> tuple[Array, Array]:
     """Gaps, shape (n, n_c), and rows of the constraints, (n, n_c + R, 5), at configurations."""
-    touches = [locate(scene, name, z) for name in phase.formation.names]
-    rows = [t.normal for t in touches] + [touches[k].tangent for k in phase.formation.rolling_rows]
+    touches = [locate(formation.scene, name, z) for name in formation.names]
+    rows = [t.normal for t in touches] + [touches[k].tangent for k in formation.rolling_rows]
     return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
 
 
-def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
+def _march(phase: Phase, z: Array, way: float) -> Trace:
     """Integrate the unit tangent up to the first event."""
-    size, until, scale = scene.scales.length, phase.until, np.sqrt(metric_weights(scene))
+    scene, until = phase.formation.scene, phase.until
+    size, scale = scene.scales.length, np.sqrt(metric_weights(scene))
     near = OVERLAP * size
 
     def tangents(z: Array) -> Array:
-        # Cofactors of the four rows: unlike null vectors of an SVD they keep their sense.
-        rows = constrain(scene, phase, z)[1] / scale
-        minors = [way * (-1) ** k * np.linalg.det(np.delete(rows, k, axis=2)) for k in range(5)]
-        tangent = np.stack(minors, axis=1)
-        size = np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
-        return np.asarray(tangent / size / scale)
+        # By minors: unlike null vectors of an SVD they keep their sense.
+        return np.asarray(way * null_vector(constrain(phase.formation, z)[1] / scale) / scale)
 
     def overlap(_: float, z: Array) -> float:
-        return float(min(room[0] for room in find_room(scene, phase, z[None]).values())) + near
+        return float(min(room[0] for room in find_room(phase.formation, z[None]).values())) + near
 
     def end(_: float, z: Array) -> float:
         if until.contact is not None or until.value is None:
@@ -132,7 +130,7 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     text = "nothing happens" if run.status == 0 else "the contacts become dependent"
     met = run.status == 1 and len(run.t_events[1]) > 0
     if run.status == 1 and not met:
-        rooms = find_room(scene, phase, last[None])
+        rooms = find_room(phase.formation, last[None])
         text = ", ".join(name for name, room in rooms.items() if room[0] < -near / 2)
         if until.contact is not None:
             touch = locate(scene, until.contact.name, last[None])
@@ -140,14 +138,14 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     return Trace(run.sol, float(run.t[-1]), last, tangents, str(until) if met else text, met)
 
 
-def find_room(scene: Scene, phase: Phase, z: Array) -> dict[str, Array]:
+def find_room(formation: Formation, z: Array) -> dict[str, Array]:
     """Room of n configurations to overlaps, and of contacts to the ends of features, (n,) [m]."""
-    touches = {f"{name} leaves": locate(scene, name, z) for name in phase.formation.names}
+    touches = {f"{name} leaves": locate(formation.scene, name, z) for name in formation.names}
     ends = {name: np.minimum(touch.low, touch.high) for name, touch in touches.items()}
-    return clearances(scene, z) | ends
+    return clearances(formation.scene, z) | ends
 
 
-def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
+def resample(formation: Formation, trace: Trace, count: int) -> tuple[Array, Array, Array]:
     """The curve at even places, and also where a contact or a joint turns.
 
     Returns
@@ -158,7 +156,7 @@ def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Arra
 
     def slide(s: Array) -> Array:
         z = trace.place(s).T
-        return slides(scene, phase, z, trace.tangents(z))
+        return slides(formation, z, trace.tangents(z))
 
     s = np.linspace(0.0, trace.length, count)
     rates = slide(s)
@@ -168,14 +166,14 @@ def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Arra
         for k, row in zip(*np.nonzero(rates[1:] * rates[:-1] < 0), strict=True)
     ]
     s = np.unique([*s, *turns])
-    s = s[np.append(True, np.diff(s) > 1e-9 * scene.scales.length)]
+    s = s[np.append(True, np.diff(s) > 1e-9 * formation.scene.scales.length)]
     z = trace.place(s).T
     return s, z, trace.tangents(z)
 
 
-def slides(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+def slides(formation: Formation, z: Array, z_s: Array) -> Array:
     """Rates of sliding of the contacts and of the joints along z_s, shape (n, n_c + 2)."""
-    rows = [(locate(scene, n, z).tangent * z_s).sum(axis=1) for n in phase.formation.names]
+    rows = [(locate(formation.scene, n, z).tangent * z_s).sum(axis=1) for n in formation.names]
     return np.column_stack([*rows, z_s[:, 3:]])
 
 
@@ -229,16 +227,15 @@ def _nearest(points: Array, body: Array) -> Array:
 Bounds = list[tuple[float | None, float | None]]
 
 
-def slow_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array) -> float:
+def slow_margin(formation: Formation, epsilon: float, z: Array, z_s: Array) -> float:
     """Least margin of all places, each at its best, for vanishing speed."""
     curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
-    margin = _solve_along(scene, phase, epsilon, curve, np.zeros(len(z)))
+    margin = _solve_along(formation, epsilon, curve, np.zeros(len(z)))
     return float(np.nan_to_num(margin, nan=-np.inf))
 
 
 def fast_margin(
-    scene: Scene,
-    phase: Phase,
+    formation: Formation,
     epsilon: float,
     curve: tuple[Array, Array, Array],
     rests: tuple[bool, bool] = (True, True),
@@ -250,15 +247,15 @@ def fast_margin(
     """
     s, z, z_s = curve
     with np.errstate(divide="ignore"):
-        joints = ((scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
-    top = np.minimum(1e6, joints / scene.scales.speed**2)
+        joints = ((formation.scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
+    top = np.minimum(1e6, joints / formation.scene.scales.speed**2)
     top[[0, -1]] *= ~np.array(rests)
     z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
-    return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top)
+    return _solve_along(formation, epsilon, (s, z, z_s, z_ss), top)
 
 
 def _solve_along(
-    scene: Scene, phase: Phase, epsilon: float, curve: tuple[Array, Array, Array, Array], top: Array
+    formation: Formation, epsilon: float, curve: tuple[Array, Array, Array, Array], top: Array
 ) -> float:
     """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
 
@@ -266,15 +263,15 @@ def _solve_along(
     interval, and the margin.
     """
     s, z, z_s, z_ss = curve
-    n, signs = len(s), _signs(scene, phase, z, z_s)
-    slope = diags_array(scene.scales.length / (2 * np.diff(s))) @ (
+    n, signs = len(s), _signs(formation, z, z_s)
+    slope = diags_array(formation.scene.scales.length / (2 * np.diff(s))) @ (
         eye_array(n - 1, n, k=1) - eye_array(n - 1, n)
     )
     upper, most, equal, equal_to = list[Any](), list[Array](), list[Any](), list[Array]()
     for side in (0, 1):
         at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
         points = z[at], z_s[at], z_ss[at]
-        laws, laws_to, rows, least = _limits(scene, phase, epsilon, *points, signs)
+        laws, laws_to, rows, least = _limits(formation, epsilon, *points, signs)
         for blocks, matrix in ((equal, laws), (upper, -rows)):
             every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
             a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
@@ -301,14 +298,14 @@ def _solve_along(
     return maximise(A_ub, np.concatenate(most), A_eq, np.concatenate(equal_to), bounds)
 
 
-def uniqueness_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
     """Least ratio of a principal minor to that without friction, on both sides, shape (n,).
 
     Forces are not unique at 0 and below.
     """
-    touches = [locate(scene, name, z) for name in phase.formation.names]
-    signs, rows = _signs(scene, phase, z, z_s), constrain(scene, phase, z)[1]
-    light, rolling = rows / scene.mass_diagonal, phase.formation.rolling_rows
+    touches = [locate(formation.scene, name, z) for name in formation.names]
+    signs, rows = _signs(formation, z, z_s), constrain(formation, z)[1]
+    light, rolling = rows / formation.scene.mass_diagonal, formation.rolling_rows
     without, ratios = light @ rows.transpose(0, 2, 1), []
     owners = np.array([*range(len(touches)), *rolling])  # contact of each row
     for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
@@ -320,9 +317,9 @@ def uniqueness_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     return np.asarray(np.min(ratios, axis=0))
 
 
-def _signs(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+def _signs(formation: Formation, z: Array, z_s: Array) -> Array:
     """Signs of sliding of contacts and joints on each interval, shape (n - 1, n_c + 2)."""
-    rates = slides(scene, phase, z, z_s)
+    rates = slides(formation, z, z_s)
     return np.asarray(np.sign(rates[1:] + rates[:-1]))
 
 
@@ -336,7 +333,7 @@ def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array
 
 
 def _limits(
-    scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array, z_ss: Array, signs: Array
+    formation: Formation, epsilon: float, z: Array, z_s: Array, z_ss: Array, signs: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Limits at n places, as rows over x = (a, b, v, c) >= least.
 
@@ -348,9 +345,10 @@ def _limits(
     equal, equal_to : (n, 3, k) and (n, 3)  Newton's and Euler's laws of the object
     rows, least : (n, m, k) and (n, m)      limits, from each of which a margin of 1 takes 1
     """
-    length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
-    n, n_c, rolling = len(z), phase.formation.n_contacts, phase.formation.rolling_rows
-    touches = [locate(scene, name, z) for name in phase.formation.names]
+    scene, scales = formation.scene, formation.scene.scales
+    length, force, speed = scales.length, scales.force, scales.speed
+    n, n_c, rolling = len(z), formation.n_contacts, formation.rolling_rows
+    touches = [locate(scene, name, z) for name in formation.names]
     mu, held = np.array([touch.friction for touch in touches]), list(rolling)
     push = -force * _push(touches, rolling, signs)
     mass = scene.mass_diagonal * speed**2
@@ -412,7 +410,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
-                follow(problem.scene, phase, z),
+                follow(phase, z),
                 key=lambda trace: (trace.reached, -trace.length if trace.reached else trace.length),
             )
             if trace.length < 0.001 * problem.scene.scales.length:
@@ -451,22 +449,22 @@ def _find_start(problem: Problem, number: int) -> Array | None:
 
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
-    scene, epsilon = problem.scene, problem.epsilon
-    s, z, z_s = resample(scene, phase, trace, PLACES)
-    slow = slow_margin(scene, phase, epsilon, z, z_s)
-    free = float(uniqueness_ratio(scene, phase, z, z_s).min())
+    formation, epsilon = phase.formation, problem.epsilon
+    s, z, z_s = resample(formation, trace, PLACES)
+    slow = slow_margin(formation, epsilon, z, z_s)
+    free = float(uniqueness_ratio(formation, z, z_s).min())
     at = f"phase {phase.number}"
     if free < UNIQUENESS.default:
         return Verdict("confirmed" if free < 0.0 else "close", f"{at}: uniqueness {free:.3g}")
     if slow > CLEAR:
         return Verdict("refuted", f"{at}: a slow motion keeps all limits by {slow:.3g}")
     rests = (_stops_before(problem, phase), phase.end is End.REST)
-    fast = fast_margin(scene, phase, epsilon, (s, z, z_s), rests)
+    fast = fast_margin(formation, epsilon, (s, z, z_s), rests)
     if fast < -1e-7:
         return Verdict("confirmed", f"{at}: no motion keeps all limits, {fast:.3g} short")
     if np.isnan(fast):
         return Verdict("open", f"{at}: the linear programme has no answer")
-    if fast > CLEAR and not scene.viscous.any():
+    if fast > CLEAR and not problem.scene.viscous.any():
         return Verdict("refuted", f"{at}: a motion keeps all limits by {fast:.3g}")
     return Verdict("close", f"{at}: slow {slow:.3g}, fast {fast:.3g}")
 
@@ -476,50 +474,51 @@ def _stops_before(problem: Problem, phase: Phase) -> bool:
 
 
 def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, float]) -> Verdict:
-    scene, epsilon, at = problem.scene, problem.epsilon, f"phase {phase.number}"
+    at = f"phase {phase.number}"
     if not _stops_before(problem, phase) or phase.end is not End.REST or phase.until.is_release:
         return Verdict("open", f"{at} does not go from rest to rest")
-    ends = list_ends(scene, phase, z, stop)
+    ends = list_ends(phase, z, stop)
     if not len(ends):
         return Verdict("open", f"{at}: no place of its end was found")
-    margin, curve, count = find_best(scene, phase, epsilon, z, ends)
+    margin, curve, count = find_best(phase.formation, problem.epsilon, z, ends)
     text = f"{at}: of {count} curves to {len(ends)} places the best has {margin:.3g}"
     if margin > CLEAR:
-        unique = uniqueness_ratio(scene, phase, curve, np.gradient(curve, axis=0)).min()
+        unique = uniqueness_ratio(phase.formation, curve, np.gradient(curve, axis=0)).min()
         return Verdict("close" if unique < UNIQUENESS.default else "refuted", text)
     # Where the best of many curves misses limits by so much, surely none keeps them.
     return Verdict("confirmed" if count and margin < -0.02 else "close", text)
 
 
-def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
+def list_ends(phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
+    scene, formation = phase.formation.scene, phase.formation
 
     def project_end(z: Array) -> Array | None:
-        return project(scene, z, lambda z: _end_equations(scene, phase, z))
+        return project(scene, z, lambda z: _end_equations(phase, z))
 
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = project_end(bend(scene, phase, z, line[None])[0, -1])
+    first = project_end(bend(formation, z, line[None])[0, -1])
     first = project_end(z) if first is None else first
     if first is None:
         return np.zeros((0, 5))
     scale, far = np.sqrt(metric_weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
-    tangent = np.linalg.svd(_end_equations(scene, phase, first)[1] / scale)[2][-1] / scale
+    tangent = np.linalg.svd(_end_equations(phase, first)[1] / scale)[2][-1] / scale
     steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
     others = [project_end(first + step * tangent) for step in steps]
     points = np.array([first, *(end for end in others if end is not None)])
-    return points[inside(scene, phase, points)]
+    return points[inside(formation, points)]
 
 
 def find_best(
-    scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array
+    formation: Formation, epsilon: float, z: Array, ends: Array
 ) -> tuple[float, Array, int]:
     """The largest `fast_margin` of curves from `z` to `ends`, the curve, (n, 5), and their number.
 
     The search stops at a curve with the margin `CLEAR`.
     """
     rng = np.random.default_rng(0)
-    start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
+    start, size = z[[0, 2]], np.array([formation.scene.scales.length, 1.0])
     goals = ends[:, [0, 2]]
     # Control points of cubic curves, shape (n, 4, 2): straight ones, and 400 that bend.
     share = np.linspace(0, 1, 4)[:, None]
@@ -529,10 +528,10 @@ def find_best(
     drawn[:, 1:3] += width * rng.normal(size=(400, 2, 2))
     margins, tried = [-np.inf], [z[None]]
     for controls, most in ((straight, len(straight)), (drawn, 40)):
-        curves = bend(scene, phase, z, controls)
-        stays = inside(scene, phase, curves.reshape(-1, 5)).reshape(len(curves), -1)
+        curves = bend(formation, z, controls)
+        stays = inside(formation, curves.reshape(-1, 5)).reshape(len(curves), -1)
         kept = curves[stays.all(axis=1)][:most]
-        margins += [_find_margin(scene, phase, epsilon, curve) for curve in kept]
+        margins += [_find_margin(formation, epsilon, curve) for curve in kept]
         tried += [*kept]
         if max(margins) > CLEAR:
             break
@@ -540,7 +539,7 @@ def find_best(
     return margins[best], tried[best], len(tried) - 1
 
 
-def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
+def bend(formation: Formation, z: Array, controls: Array) -> Array:
     """Configurations of cubic curves from `z`, forty along each, shape (n, 40, 5)."""
     u = np.linspace(0.0, 1.0, 40)[:, None]
     shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
@@ -551,9 +550,9 @@ def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
         place = curves[:, k - 1].copy()
         place[:, [0, 2]] = poses[:, k]
         for _ in range(6):
-            gaps, rows = constrain(scene, phase, place)
+            gaps, rows = constrain(formation, place)
             rows = rows[:, :, [1, 3, 4]]
-            flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
+            flat = np.abs(np.linalg.det(rows)) < 1e-12 * formation.scene.scales.length**2
             rows[flat] = np.eye(3)
             step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
             place[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
@@ -561,33 +560,33 @@ def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
     return curves
 
 
-def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
+def inside(formation: Formation, z: Array) -> Flags:
     """Whether contacts touch within their features at n configurations, and nothing overlaps.
 
     Up to 1e-4 of the radius of gyration.
     """
-    gaps, _ = constrain(scene, phase, z)
-    good = np.isfinite(z).all(axis=1) & (np.abs(gaps) < 1e-8 * scene.scales.length).all(axis=1)
-    for room in find_room(scene, phase, z).values():
-        good &= room > -1e-4 * scene.scales.length
+    (gaps, _), size = constrain(formation, z), formation.scene.scales.length
+    good = np.isfinite(z).all(axis=1) & (np.abs(gaps) < 1e-8 * size).all(axis=1)
+    for room in find_room(formation, z).values():
+        good &= room > -1e-4 * size
     return np.asarray(good)
 
 
-def _find_margin(scene: Scene, phase: Phase, epsilon: float, z: Array) -> float:
-    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ metric_weights(scene))
-    if runs.min() < 1e-6 * scene.scales.length:
+def _find_margin(formation: Formation, epsilon: float, z: Array) -> float:
+    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ metric_weights(formation.scene))
+    if runs.min() < 1e-6 * formation.scene.scales.length:
         return -np.inf
     s = np.append(0.0, np.cumsum(runs))
-    margin = fast_margin(scene, phase, epsilon, (s, z, np.gradient(z, s, axis=0, edge_order=2)))
+    margin = fast_margin(formation, epsilon, (s, z, np.gradient(z, s, axis=0, edge_order=2)))
     return float(np.nan_to_num(margin, nan=-np.inf))
 
 
-def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+def _end_equations(phase: Phase, z: Array) -> tuple[Array, Array]:
     """What is missing to contacts and end at one configuration, and its rows."""
-    (gaps,), (rows,) = constrain(scene, phase, z[None])
+    (gaps,), (rows,) = constrain(phase.formation, z[None])
     places, contact = dict(phase.until.poses), phase.until.contact
     if contact is not None:
-        touch = locate(scene, contact.name, z[None])
+        touch = locate(phase.formation.scene, contact.name, z[None])
         gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
     missing = [z[k] - value for k, value in places.items()]
     return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])

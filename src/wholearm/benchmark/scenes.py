@@ -11,7 +11,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +23,7 @@ from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, find_touching
 from ..mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
 from ..mapping.formation_list import Stretch, format_route, list_formations, tolerance
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Problem
 from ..problem.read import build_problem
 from ..verification.newton_euler import locate
 from .refusals import slow_margin
@@ -241,11 +241,10 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
         if np.isnan(z).any():
             return False
         formation = Formation(scene, stretch.contacts)
-        phase = Phase(0, formation, replace(stretch.until, pins=()))
         for place, following in zip(z[::2], z[1::2], strict=True):
             way = np.array([following - place] * 2)
             pair = np.array([place, following])
-            if slow_margin(scene, phase, problem.epsilon, pair, way) < 0:
+            if slow_margin(formation, problem.epsilon, pair, way) < 0:
                 return False
     return True
 

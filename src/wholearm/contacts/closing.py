@@ -53,11 +53,6 @@ def contact_table(scene: Scene) -> tuple[Contact, ...]:
     return tuple(c for finger in (None, 0, 1) for c in candidate_contacts(scene, finger))
 
 
-@lru_cache(maxsize=1024)
-def _make_single(scene: Scene, index: int) -> Formation:
-    return Formation(scene, (contact_table(scene)[index],))
-
-
 def first_contact(scene: Scene, finger: int) -> int:
     """Index into `contact_table` of a finger's first contact."""
     # Sides and edges of finger 1, and the arc of its tip where that is rounded.
@@ -84,9 +79,7 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
 
 def close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
-    if len(x) <= CHUNK:
-        return _close_fingers(scene, x, phi)
-    cuts = range(0, len(x), CHUNK)
+    cuts = range(0, max(len(x), 1), CHUNK)
     parts = [_close_fingers(scene, x[k : k + CHUNK], phi[k : k + CHUNK]) for k in cuts]
     return ClosedFinger(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
@@ -228,12 +221,12 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
 
     `labels` (n, n_c) are indices into `contact_table`; z, v (n, 5), v is `z` if left out.
     """
-    v = z if v is None else v
+    v, table = z if v is None else v, contact_table(scene)
     C, P_dot_v = np.empty((2, *labels.shape))
     A, A_t = np.empty((2, *labels.shape, 5))
     for index in np.unique(labels).tolist():
         rows, places = np.nonzero(labels == index)
-        contact = _make_single(scene, index).evaluate(z[rows], v[rows])
+        contact = Formation(scene, (table[index],)).evaluate(z[rows], v[rows])
         C[rows, places], P_dot_v[rows, places] = contact.C[:, 0], contact.P_dot_v[:, 0]
         A[rows, places], A_t[rows, places] = contact.A[:, 0], contact.A_t[:, 0]
     return Kinematics(C, A, A_t, A, P_dot_v)

@@ -40,7 +40,7 @@ def _identify_limits(formation: Formation) -> Hashable:
     return formation.scene.shape, formation.scene.fingers_collide, formation.contacts
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Formation:
     """A contact formation of a scene."""
 

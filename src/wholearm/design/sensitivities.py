@@ -26,9 +26,9 @@ from ..common.document import Document, Result, Table, fixed
 from ..common.errors import SolverError, WholearmError
 from ..common.parallel import count_cores, share
 from ..common.sharing import exclusive
-from ..geometry.curve import Curve, tangent_basis
+from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase, trace_phases
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import find_freedoms, metric_weights
 from ..mechanics.limits import LimitSet
 from ..planning.blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from ..planning.options import Objective, PlanOptions
@@ -264,11 +264,12 @@ def find_lagrangian(planning: Planning) -> Evaluate:
         price = None
         if made:
             formation, h = problem.phases[made[-1][0]].formation, STEP * scene.scales.length
-            price, roots = np.zeros(5), np.sqrt(metric_weights(scene))
-            for u in np.linalg.qr(roots[:, None] * tangent_basis(formation, block.end))[0].T:
-                ends = [block.end + sign * h * u / roots for sign in (1, -1)]
+            price, metric = np.zeros(5), metric_weights(scene)
+            P = formation.evaluate(block.end[None], np.zeros((1, 5))).P[0]
+            for d in find_freedoms(P, metric, 1e-9).T:
+                ends = [block.end + sign * h * d for sign in (1, -1)]
                 high, low = (sum(term[2] for term in evaluate(problem, end)[0]) for end in ends)
-                price += (high - low) / (2 * h) * u * roots
+                price += (high - low) / (2 * h) * metric * d
         made.append((block.phases[0].index, use_time(planning, block, price)))
     return evaluate
 

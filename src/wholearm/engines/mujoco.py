@@ -66,8 +66,7 @@ def write_mjcf(
     _add_geom(
         world, engine.PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3"
     )
-    _add_object(world, scene, home[:3])
-    _add_links(world, scene, home[3:])
+    _add_bodies(world, scene, home)
     contact = add(root, "contact")
     for pair in engine.list_pairs(scene):
         rough = pair.friction > 0
@@ -120,18 +119,16 @@ def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None
     add(body, "geom", name=name, type=kind, contype="0", conaffinity="0", **attributes)
 
 
-def _add_object(world: Element, scene: Scene, q: Array) -> None:
-    polygon = scene.polygon
-    body = add(world, "body", name=engine.OBJECT, pos=[*q[:2], 0.0])
+def _add_bodies(world: Element, scene: Scene, z: Array) -> None:
+    """Object and links at a configuration, shape (5,), on their joints."""
+    polygon, (x, y, phi, *theta) = scene.polygon, z.tolist()
+    body = add(world, "body", name=engine.OBJECT, pos=[x, y, 0.0])
     add(body, "inertial", pos=[0, 0, 0], mass=polygon.mass, diaginertia=[polygon.inertia] * 3)
     for axis, (name, kind) in enumerate((("x", "slide"), ("y", "slide"), ("phi", "hinge"))):
-        add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=q[axis])
-    turned = [0.0, 0.0, q[2]]
+        add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=z[axis])
+    turned = [0.0, 0.0, phi]
     _add_geom(body, engine.OBJECT, "mesh", mesh=engine.OBJECT, euler=turned, rgba=".9 .7 .3 1")
-    _add_shapes(body, scene, q[2])
-
-
-def _add_links(world: Element, scene: Scene, theta: Array) -> None:
+    _add_shapes(body, scene, phi)
     for k, link in enumerate(scene.fingers):
         place = [*np.asarray(link.base), 0.0]
         # The weight of links is no part of the model.

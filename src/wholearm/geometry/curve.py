@@ -128,14 +128,10 @@ class Curve:
 
     def sliding(self, s: Array) -> Array:
         """Sliding rates A_t z_s of the contacts and rates of the joints, shape (n, n_c + 2)."""
-        z, tangent = self.interpolate(s)
-        return self._find_rates(self.formation.evaluate(z, tangent), tangent)
-
-    def _find_rates(self, kinematics: Kinematics, tangent: Array) -> Array:
-        z_s, rho = tangent * self.speed_ratio, self.formation.scene.polygon.gyration_radius
-        slip = np.einsum("nij,nj->ni", kinematics.A_t, z_s)
+        point, rho = self.evaluate(s), self.formation.scene.polygon.gyration_radius
+        slip = np.einsum("nij,nj->ni", point.kinematics.A_t, point.z_s)
         slip[:, list(self.formation.rolling_rows)] = 0.0
-        return np.hstack([slip, rho * z_s[:, 3:]])
+        return np.hstack([slip, rho * point.z_s[:, 3:]])
 
     @property
     def is_regular(self) -> bool:
@@ -150,12 +146,7 @@ class Curve:
         """The curve split at its reversals; `LinAlgError` where contacts are dependent."""
         grids = [refine(panel.s, self.length) for panel in self.panels]
         grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
-        z, tangent = self.interpolate(grid)
-        kinematics = self.formation.evaluate(z, tangent)
-        solve_tangent(
-            kinematics.P, kinematics.P_dot_v, tangent, metric_weights(self.formation.scene)
-        )
-        rates = self._find_rates(kinematics, tangent)
+        rates = self.sliding(grid)
         rates[np.abs(rates) < 1e-9] = 0.0
         breaks = []
         for column in range(rates.shape[1]):

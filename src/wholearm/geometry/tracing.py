@@ -102,19 +102,30 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
     touch or the `until` is never reached.
     """
     require_touching(phase, z)
-    if not phase.until.is_release:
-        return _trace_phase(phase, z)
-    formation, until = phase.formation, phase.until
-    ends = [*(p.until for p in later if not p.until.is_release), until]
-    curves = [trace_curve(formation, z, v, until) for v in _headings(formation, z, ends[0])]
-    curve, least = max(curves, key=lambda curve: curve.length), HELD * formation.scene.scales.length
-    same = later and set(later[0].formation.contacts) == set(formation.contacts)
-    if same and curves[0].length >= least:
-        # Only modes change, anywhere on the path to the next end of a phase.
-        curve = curves[0]
-    if curve.length < least:
-        raise InputError("", f"phases[{phase.number}].contacts", f"cannot move: {curve.ending}")
-    return curve
+    formation, until, rho = phase.formation, phase.until, phase.formation.scene.scales.length
+    key = f"phases[{phase.number}]"
+    if until.is_release:
+        ends = [*(p.until for p in later if not p.until.is_release), until]
+        curves = [trace_curve(formation, z, v, until) for v in _headings(formation, z, ends[0])]
+        curve, least = max(curves, key=lambda curve: curve.length), HELD * rho
+        same = later and set(later[0].formation.contacts) == set(formation.contacts)
+        if same and curves[0].length >= least:
+            # Only modes change, anywhere on the path to the next end of a phase.
+            curve = curves[0]
+        if curve.length < least:
+            raise InputError("", f"{key}.contacts", f"cannot move: {curve.ending}")
+        return curve
+    if _holds(formation, until, z):
+        raise InputError("", f"{key}.until", f"{until} holds already at the start of the phase")
+    reason = []
+    for heading in _headings(formation, z, until):
+        curve = trace_curve(formation, z, heading, until)
+        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and curve.is_regular:
+            return curve
+        reason.append(curve.ending)
+    text = f"going one way {reason[0]}, going the other way {reason[1]}"
+    text += "; one freedom leaves no choice" if until.pins else ""
+    raise InputError("", f"{key}.until", f"{until} is never reached: {text}")
 
 
 def require_touching(phase: Phase, z: Array) -> None:
@@ -132,22 +143,6 @@ def require_touching(phase: Phase, z: Array) -> None:
     if limits.min() < -touching:
         text = formation.limits[int(limits.argmin())].text
         raise InputError("", key, f"cannot hold at {describe_pose(z)}: {text}")
-
-
-def _trace_phase(phase: Phase, z: Array) -> Curve:
-    formation, until, rho = phase.formation, phase.until, phase.formation.scene.scales.length
-    key = f"phases[{phase.number}].until"
-    if _holds(formation, until, z):
-        raise InputError("", key, f"{until} holds already at the start of the phase")
-    reason = []
-    for heading in _headings(formation, z, until):
-        curve = trace_curve(formation, z, heading, until)
-        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and curve.is_regular:
-            return curve
-        reason.append(curve.ending)
-    text = f"going one way {reason[0]}, going the other way {reason[1]}"
-    text += "; one freedom leaves no choice" if until.pins else ""
-    raise InputError("", key, f"{until} is never reached: {text}")
 
 
 def _holds(formation: Formation, until: Until, z: Array) -> bool:

@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import pairwise, permutations, product
 from typing import NamedTuple
 
@@ -233,7 +232,7 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
 
 def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list[Contact]:
     """Contacts that do not touch at `z`."""
-    gaps = _form(scene, contacts).evaluate(z[None], z[None]).C[0]
+    gaps = Formation(scene, contacts).evaluate(z[None], z[None]).C[0]
     return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > scene.touching]
 
 
@@ -246,7 +245,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
         try:
             for contacts, until in steps:
                 start = end
-                phase = Phase(index + len(walked), _form(scene, contacts), until)
+                phase = Phase(index + len(walked), Formation(scene, contacts), until)
                 end = find_end(phase, start)
                 moved = metric_weights(scene) @ (end - start) ** 2
                 if moved < (STILL * scene.scales.length) ** 2:
@@ -272,7 +271,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
 
 def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
     """Whether a formation holds at `z`."""
-    return not _list_missing(scene, z, contacts) and is_inside(_form(scene, contacts), z)
+    return not _list_missing(scene, z, contacts) and is_inside(Formation(scene, contacts), z)
 
 
 def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
@@ -312,11 +311,6 @@ def end_at(scene: Scene, row: int, pose: Array) -> Until:
         return Until(coordinate="x", value=round(float(pose[0]), digits))
     degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
     return Until(coordinate="phi", value=math.radians(degrees))
-
-
-@lru_cache(maxsize=64)
-def _form(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
-    return Formation(scene, contacts)
 
 
 def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:

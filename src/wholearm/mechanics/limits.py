@@ -82,6 +82,11 @@ class LimitSet:
         bounds = np.concatenate([self.low[lows], self.high[highs]])
         return np.concatenate([lows, highs]), signs, bounds
 
+    @cached_property
+    def side_scales(self) -> Array:
+        """Units of the shortfalls of one-sided limits, shape (n,)."""
+        return np.asarray(self.scales[self.sides[0]])
+
     def of(self, *kinds: str) -> NDArray[np.int64]:
         """Rows of the limits of some kinds."""
         return np.flatnonzero([self.limits[k].kind in kinds for k in self.owners])
@@ -119,6 +124,13 @@ class LimitSet:
         """How far one-sided limits are from being missed, shape (..., n), from rows y, (..., m)."""
         rows, signs, bounds = self.sides
         return np.asarray(signs * (values[..., rows] - bounds))
+
+    def find_slack_rows(self, values: Array) -> Array:
+        """Coefficients of `find_slack`, (..., n, k), from those of rows y, (..., m, k): 1 first."""
+        rows, signs, bounds = self.sides
+        slack = signs[:, None] * values[..., rows, :]
+        slack[..., 0] -= signs * bounds
+        return np.asarray(slack)
 
     def fold(self, of_sides: Array) -> Array:
         """The larger value of the sides of each row, shape (..., m), from (..., n)."""

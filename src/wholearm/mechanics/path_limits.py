@@ -161,10 +161,8 @@ def find_value_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array
 
 def find_slack_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
     """Coefficients of the slack of each side over its scale, shape (n, n_sides, 5)."""
-    rows, signs, bounds = limits.sides
-    slack = signs[:, None] * find_value_rows(limits, forces, rates)[:, rows]
-    slack[..., ONE] -= signs * bounds
-    return np.asarray(slack / limits.scales[rows, None])
+    slack = limits.find_slack_rows(find_value_rows(limits, forces, rates))
+    return np.asarray(slack / limits.side_scales[:, None])
 
 
 def find_speed_cap(limits: LimitSet, rates: Array) -> Array:

@@ -20,10 +20,10 @@ from ..results.dwell_record import assemble
 from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
 from ..results.torque import ERROR, format_rows, place_rows, read_rows, sample_rows
-from ..results.trajectory import Samples, Trajectory
+from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
-from ..verification.verdict import Allowance, find_least_force, measure_departure
+from ..verification.verdict import Allowance, measure_departure
 from ..verification.verify import describe_motors, find_commands, judge, observe
 from .blocks import BlockPlan, Planning, plan_each
 
@@ -104,9 +104,8 @@ def replay_plan(
             )
         planning = better
     assert isinstance(check.report, Report)
-    pairs = [(find_least_force(phase), phase.number) for phase in check.report.phases]
-    forces = [(force, number) for force, number in pairs if force is not None]
-    least, number = min(forces, key=lambda pair: pair[0].least)
+    least, number = check.report.least_force
+    assert least is not None
     figures = ReplayFigures(
         LeastForce(least.least, least.contact, number, least.time),
         tuple(
@@ -189,25 +188,20 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     if len(trajectory.t) < 100 * len(trajectory.motions):
         trajectory = assemble(trajectory.motions, trajectory.torque, {}, 201)  # rows per phase
     worst = Residual(0.0, 1, "")
-    for phase in problem.phases:
-        # Forces are not determined in a dwell.
-        rows = (trajectory.phase == phase.index) & ~trajectory.held
-        formation, motion = phase.formation, trajectory.motions[phase.index]
-        columns = [trajectory.contacts.index(name) for name in motion.contacts]
+    # Forces are not determined in a dwell.
+    moving = ~trajectory.held
+    t, phases, *samples = (
+        getattr(trajectory, name)[moving] for name in ("t", "phase", *Samples._fields)
+    )
+    motions = sample_phases(t, phases, Samples(*samples), trajectory.contacts)
+    for phase, motion in zip(problem.phases, motions, strict=True):
+        formation = phase.formation
         contacts = {contact.name: contact for contact in formation.contacts}
-        samples = Samples(
-            trajectory.z[rows],
-            trajectory.z_dot[rows],
-            trajectory.z_ddot[rows],
-            trajectory.tau[rows],
-            trajectory.c_n[rows][:, columns],
-            trajectory.c_t[rows][:, columns],
-        )
         motion_contacts = [contacts[name] for name in motion.contacts]
-        left = balance(problem.scene, motion_contacts, formation.rolling, samples)
+        left = balance(problem.scene, motion_contacts, formation.rolling, motion.samples)
         size, row, text = left.find_worst()
         if not size <= worst.size:
-            when = f"at t = {trajectory.t[rows][row]:.5g} s, phase {phase.number}"
+            when = f"at t = {motion.t[row]:.5g} s, phase {phase.number}"
             worst = Residual(size, phase.number, f"{text} {when}")
     return worst
 
@@ -295,7 +289,7 @@ def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
     phases = []
     for index in range(len(trajectory.motions)):
         phase = report.phases[index] if index < len(report.phases) else None
-        least = find_least_force(phase) if phase else None
+        least = phase.least_force if phase else None
         phases.append(
             {
                 "phase": index + 1,

@@ -38,7 +38,7 @@ from ..mechanics.dynamics import (
     stack_motion,
 )
 from ..mechanics.limits import LimitSet, make_limits
-from ..mechanics.path_limits import PathLimits, find_slack_rows
+from ..mechanics.path_limits import PathLimits, find_value_rows
 from ..mechanics.sensitivity import find_force_slopes, find_shifts
 from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
 from ..problem.definition import GROUPS, PARAMETERS, End, Phase, Problem, change_scene
@@ -126,7 +126,7 @@ def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
     slack = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
     beyond = np.tile(UNLIMITED, (size, slack.shape[1], 1))
     beyond[-1] = slack[0]
-    unit = np.tile(SETTINGS.least * limits.scales[limits.sides[0]], (size, 1))
+    unit = np.tile(SETTINGS.least * limits.side_scales, (size, 1))
     return rows._replace(
         slack=np.concatenate([rows.slack, beyond], axis=1),
         unit=np.concatenate([rows.unit, unit], axis=1),
@@ -156,8 +156,7 @@ def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
 
 def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Array:
     """Slack of limits, (n, m, 5) [N, N m], from coefficients of c and torques; `rates` (n, 2)."""
-    rows = find_slack_rows(limits, PathForces(c, torque), rates)
-    return np.asarray(rows * limits.scales[limits.sides[0], None])
+    return limits.find_slack_rows(find_value_rows(limits, PathForces(c, torque), rates))
 
 
 def of_forces(limits: LimitSet) -> Array:
@@ -183,10 +182,10 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         changes = np.append(changes, delay[:, :, None], axis=2)
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
         error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
-        unit.append(SETTINGS.least * contact.scales[contact.sides[0]] + error)
+        unit.append(SETTINGS.least * contact.side_scales + error)
     slack[1][have_same_signs(*sides)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
-    unit.append(np.tile(SETTINGS.spare * joint.scales[joint.sides[0]], (len(s), 1)))
+    unit.append(np.tile(SETTINGS.spare * joint.side_scales, (len(s), 1)))
     table, units = (np.concatenate(parts, axis=1) for parts in (slack, unit))
     return CurveLimitRows(s, torque, table, units, 2 * slack[0].shape[1])
 
@@ -335,8 +334,8 @@ def find_within(
     contact, joint = split_limits(formation)
     none = np.zeros((len(s), formation.n_constraints, 5))
     left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
-    scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
-    unit = np.concatenate([np.maximum(SETTINGS.least * scales, least), SETTINGS.spare * most])
+    forces = np.maximum(SETTINGS.least * contact.side_scales, least)
+    unit = np.concatenate([forces, SETTINGS.spare * joint.side_scales])
     same = have_same_signs(*sides)
     return Within(s, nominal, left, (corners[0], corners[1]), same, unit)
 

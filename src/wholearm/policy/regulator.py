@@ -333,26 +333,22 @@ def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     return None if hold is None else hold.tau
 
 
-class PlannedPhase(NamedTuple):
-    """A phase of a plan."""
-
-    motion: Motion
-    torque: TorqueProfile  # from the start of the phase
-    modes: Any  # its spans of contact modes
+PhaseParts = tuple[Motion, TorqueProfile, Any]
+"""Motion of a phase, torques from its start on, and spans of its contact modes."""
 
 
-def list_phases(plan: Trajectory) -> list[PlannedPhase]:
+def list_phases(plan: Trajectory) -> list[PhaseParts]:
     """The phases of a plan."""
     torques = [plan.torque.cut(*span) for span in pairwise(plan.phase_starts.tolist())]
     torques = [replace(torque, breaks=torque.breaks - torque.breaks[0]) for torque in torques]
-    return list(map(PlannedPhase, plan.motions, torques, plan.meta["modes"]))
+    return list(zip(plan.motions, torques, plan.meta["modes"], strict=True))
 
 
 def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Problem, Trajectory]:
     """Phases and plan with blocks off curves planned anew, with a margin, where possible."""
-    blocks, phases, parts = split_blocks(problem), list[Phase](), list[PlannedPhase]()
+    blocks, phases, parts = split_blocks(problem), list[Phase](), list[PhaseParts]()
     while blocks:
-        (block, *later), replacement = blocks, list[PlannedPhase]()
+        (block, *later), replacement = blocks, list[PhaseParts]()
         if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
             for stop, share, longest in STOPS:
                 stopped = _stop(block, plan, stop)
@@ -366,9 +362,9 @@ def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Proble
         while blocks and blocks[0][0].index < len(parts):
             phases += blocks.pop(0)
     samples = int(np.bincount(plan.phase).max())
-    meta = {**plan.meta, "modes": [part.modes for part in parts]}
-    torque = TorqueProfile.chain([part.torque for part in parts])
-    whole = assemble([part.motion for part in parts], torque, meta, samples)
+    motions, torques, modes = zip(*parts, strict=True)
+    meta = {**plan.meta, "modes": [*modes]}
+    whole = assemble(motions, TorqueProfile.chain(torques), meta, samples)
     return replace(problem, phases=tuple(phases)), whole
 
 
@@ -406,12 +402,12 @@ def _replan_blocks(
     plan: Trajectory,
     share: float,
     longest: float,
-) -> list[PlannedPhase]:
+) -> list[PhaseParts]:
     """Phases with a share of the margin until the plan is reached again; none if it is not.
 
     Those with several freedoms last at most `longest` times as long.
     """
-    starts, phases, scene = plan.phase_starts, list[PlannedPhase](), problem.scene
+    starts, phases, scene = plan.phase_starts, list[PhaseParts](), problem.scene
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
     for block in blocks:

@@ -185,6 +185,12 @@ class PhaseReport(NamedTuple):
     uniqueness_margin: UniquenessMargin | None = None  # None if nothing was seen moving
     wedged: float | None = None  # [s]: how long friction could have held it; None if not at rest
 
+    @property
+    def least_force(self) -> ContactMargin | None:
+        """The contact with the least normal force; None if nothing moved."""
+        margins = [margin for margin in self.contacts if not math.isnan(margin.least)]
+        return min(margins, key=lambda margin: margin.least, default=None)
+
 
 class ModeChange(NamedTuple):
     """A contact or joint that goes on in another mode while the rest moves."""
@@ -272,6 +278,12 @@ class Report(Result):
     def reason(self) -> str:
         """The one sentence behind the verdict: the first failure, or that the goal is reached."""
         return self.failures[0] if self.failures else self.outcome
+
+    @property
+    def least_force(self) -> tuple[ContactMargin | None, int]:
+        """The contact with the least normal force, and the number of its phase, if any moved."""
+        pairs = [(one, phase.number) for phase in self.phases if (one := phase.least_force)]
+        return min(pairs, key=lambda pair: pair[0].least, default=(None, 0))
 
     @property
     def document(self) -> Document:

@@ -76,7 +76,7 @@ def list_units(formation: Formation) -> tuple[Unit, ...]:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Mode:
     """A formation with what rolls or sticks and is held.
 
@@ -125,10 +125,7 @@ def find_mode(formation: Formation, signs: Array) -> Mode:
     held: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
     if formation.n_constraints < 4:
         held += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
-    return _share_mode(formation, tuple(sorted(held)))
-
-
-_share_mode = lru_cache(maxsize=64)(Mode)
+    return Mode(formation, tuple(sorted(held)))
 
 
 def list_modes(

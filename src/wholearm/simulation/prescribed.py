@@ -69,14 +69,10 @@ _OUTCOMES = {
 }
 
 
-def _interpolate_stages() -> tuple[Array, Array]:
-    """Chebyshev points of a step, and values there from those at `INNER_STAGES` and the ends."""
-    nodes = np.array([0.0, *(NODES[stage] for stage in INNER_STAGES), 1.0])[:, None]
-    places, powers = (1 - np.cos(np.pi * np.arange(17) / 16)) / 2, np.arange(len(nodes))
-    return places, np.asarray(places[:, None] ** powers @ np.linalg.inv(nodes**powers))
-
-
-_PLACES, _INSIDE = _interpolate_stages()
+_STAGES = np.array([0.0, *(NODES[stage] for stage in INNER_STAGES), 1.0])[:, None]
+_POWERS, _PLACES = np.arange(len(_STAGES)), (1 - np.cos(np.pi * np.arange(17) / 16)) / 2
+_INSIDE = _PLACES[:, None] ** _POWERS @ np.linalg.inv(_STAGES**_POWERS)
+"""Chebyshev points of a step, and values there from those at `INNER_STAGES` and the ends."""
 
 
 class PhaseEnds(NamedTuple):

@@ -20,7 +20,7 @@ from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem
 from ..results.plan_record import Deviation
-from ..results.report import ContactMargin, Failure, FingerGap, PhaseReport, UniquenessMargin
+from ..results.report import Failure, FingerGap, PhaseReport, UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
@@ -142,12 +142,6 @@ def describe_thin_margins(
                 text = f"below epsilon = {problem.epsilon:g} N, at t = {c.time:.5g} s"
                 text = f"c_n of {c.contact} falls to {c.least:.5g} N, {text}, phase {phase.number}"
                 yield Failure(phase.number, text)
-
-
-def find_least_force(phase: PhaseReport) -> ContactMargin | None:
-    """The contact with the least normal force in a phase; None if nothing moved."""
-    margins = [margin for margin in phase.contacts if not math.isnan(margin.least)]
-    return min(margins, key=lambda margin: margin.least, default=None)
 
 
 def find_uniqueness_margin(

@@ -644,7 +644,7 @@ def find_resting_changes(
         towards = [] if gradient is None else [-gradient @ path.response.acceleration]
         rows = np.vstack([path.margins, *towards])
         sizes = np.abs(rows) @ [1.0, unit, unit]
-        scale = [limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)]
+        scale = [limits.side_scales, np.where(sizes > 0, sizes, 1.0)]
         sides = np.vstack([find_sides(limits, path.response, np.zeros(5)), rows])
         starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
     changes: list[results.TorqueAdvice] = []
@@ -670,10 +670,7 @@ def find_sides(limits: LimitSet, response: modes.Response, v: Array) -> Array:
     values = of_c @ np.vstack([response.c[: formation.n_contacts], rolling])
     values[:, 1:] += of_tau
     values[:, 0] += of_rates @ v[3:]
-    rows, signs, bounds = limits.sides
-    sides = np.asarray(signs[:, None] * values[rows])
-    sides[:, 0] -= signs * bounds
-    return sides
+    return limits.find_slack_rows(values)
 
 
 def find_moving(

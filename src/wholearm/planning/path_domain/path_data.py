@@ -76,7 +76,7 @@ class PhaseData(NamedTuple):
     @property
     def spans(self) -> Array:
         """Scale of each side of the limits, shape (n_sides,)."""
-        return self.limits.scales[self.limits.sides[0]]
+        return self.limits.side_scales
 
     def find_terms(self) -> Array:
         """Coefficients of the limited values at the nodes, shape (n, m, 5)."""

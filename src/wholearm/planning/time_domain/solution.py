@@ -479,7 +479,7 @@ class TimeIterate:
             price = np.zeros_like(miss.held)
             for side, on_rows, indices in rows.parts:
                 price[:, side] += (on_g if on_rows else on_x)[indices].sum(axis=1)
-            cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
+            cost = (price * miss.held * rows.limits.side_scales).sum(axis=1)
             prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
             # Errors of collocation decrease with the scheme's order, costs with the third one.
             dear = np.maximum(prices[-1] / SETTINGS.dear, 1.0)
@@ -607,7 +607,7 @@ def find_misses(
     c = [samples.c_n, samples.c_t[:, list(formation.rolling_rows)]]
     values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
     values[:, limits.of(PRESS)] -= margin
-    slack = limits.find_slack(values) / limits.scales[limits.sides[0]]
+    slack = limits.find_slack(values) / limits.side_scales
     of_c, _, of_rates = limits.columns
     bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
     slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
