@@ -47,23 +47,21 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return run
 
 
-def stored(
-    identify: Callable[[Any], Hashable],
-) -> Callable[[Callable[[Any], _T]], Callable[[Any], _T]]:
+def stored(identify: Callable[..., Hashable]) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Have a function keep what it builds of CasADi objects, the values that were used last.
 
-    Owners for which `identify` gives equal keys share one value.
+    Arguments for which `identify` gives equal keys share one value.
     """
 
-    def decorate(build: Callable[[Any], _T]) -> Callable[[Any], _T]:
+    def decorate(build: Callable[..., _T]) -> Callable[..., _T]:
         values: OrderedDict[Hashable, _T] = OrderedDict()
 
         @wraps(build)
         @exclusive
-        def find(owner: Any) -> _T:
-            key = identify(owner)
+        def find(*owners: Any) -> _T:
+            key = identify(*owners)
             if key not in values:
-                values[key] = build(owner)
+                values[key] = build(*owners)
             values.move_to_end(key)
             if len(values) > KEPT:
                 values.popitem(last=False)

@@ -119,6 +119,7 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
     ]
 
 
+@stored(lambda contact, scene: (contact, scene.shape))
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     """Return the limits of one contact's own range: between base and tip, between two vertices.
 
@@ -184,6 +185,7 @@ def list_renamed(
     return {old: c for old in lost for c in new if takes_over(c, scene, [old])}
 
 
+@stored(lambda contact, scene, touching: (contact, scene.shape, touching))
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
 

@@ -164,7 +164,7 @@ def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
 def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Batch]:
     """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
     candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
-    values = ca.vertcat(*(build_clearance(c, scene, touching=False).value for c in candidates))
+    values = ca.vertcat(*(build_clearance(c, scene, False).value for c in candidates))
     function = ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
     return candidates, Batch(function)
 
@@ -177,6 +177,7 @@ def describe(contacts: Sequence[Contact]) -> str:
 _V = ca.SX.sym("v", 5)  # of all scenes, as z is
 
 
+@stored(lambda contact, scene: (contact, scene.shape))
 def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     """Gap, rows A and A_t, A' v, slip coordinate [m] and A_t' v of a contact."""
     features = build_features(scene)
