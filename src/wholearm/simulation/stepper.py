@@ -357,16 +357,34 @@ def build_step(
 
     Components of y (n,) from `moving` on are integrals along the motion; errors do not cover them.
     """
-    rates, heads = list[Expression](), list[Expression]()
-
-    def combine(weights: dict[int, float], rates: Sequence[Expression] = heads) -> Expression:
-        return h * (ca.horzcat(*(rates[k] for k in weights)) @ ca.DM(list(weights.values())))
-
-    for node, row in zip(NODES, ROWS, strict=True):
-        place = (y[:moving] + combine(row), t + node * h) if row else (y[:moving], t)
+    stages, last = _build_combinations(y.shape[0], moving)
+    rates: list[Expression] = []
+    for combine, row in zip(stages, ROWS, strict=True):
+        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y[:moving], t)
         rates.append(rate(*place))
-        heads.append(rates[-1][:moving])
-    return y + combine(WEIGHTS, rates), combine(ERROR_5), combine(ERROR_3)
+    end, fifth, third = last(y, t, h, *rates)
+    return end, fifth, third
+
+
+@lru_cache(maxsize=8)
+def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expression]:
+    """CasADi functions of y, t, h and rates of stages, for any right-hand side of length n.
+
+    Those of the stages return state and time of each stage, the last one the end and both errors.
+    """
+    y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
+    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(ROWS))]
+
+    def combine(weights: dict[int, float], count: int = n) -> Expression:
+        used = ca.horzcat(ca.SX(count, 0), *(rates[stage][:count] for stage in weights))
+        return h * (used @ ca.DM(list(weights.values())))
+
+    stages = []
+    for node, row in zip(NODES, ROWS, strict=True):
+        place = [y[:moving] + combine(row, moving), t + node * h]
+        stages.append(ca.Function("stage", [y, t, h, *(rates[j] for j in row)], place))
+    ends = [y + combine(WEIGHTS), combine(ERROR_5, moving), combine(ERROR_3, moving)]
+    return stages, ca.Function("last", [y, t, h, *rates], ends)
 
 
 def build_error(
