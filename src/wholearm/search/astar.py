@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count, pairwise, takewhile
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -60,7 +60,6 @@ BEYOND = 1.1  # largest estimate of a route over that of the best one
 NEARBY = 30  # most places of `find_first`
 MEASURED, MORE = 24, 8  # most edges planned until there is a route, and after it
 SETTLED = 240  # most places that are settled to bound routes from below
-T = TypeVar("T")
 
 
 class Heuristic(NamedTuple):
