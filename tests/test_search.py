@@ -268,13 +268,9 @@ def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
 
     tasks = [partial(plan, part) for part in parts]
     for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
-        assert isinstance(one, edge_plans.PartPlan) and isinstance(other, edge_plans.PartPlan), (
-            one,
-            other,
-        )
+        assert isinstance(one, list) and isinstance(other, list), (one, other)
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
-        assert one.duration == pytest.approx(other.duration, rel=1e-6)
-        for (mine, motion), (theirs, again) in zip(one.phases, other.phases, strict=True):
+        for (mine, motion), (theirs, again) in zip(one, other, strict=True):
             assert dict(mine.until.pins) == pytest.approx(dict(theirs.until.pins), abs=1e-6)
             if motion and again:
                 assert motion.duration == pytest.approx(again.duration, rel=1e-6)

@@ -299,6 +299,14 @@ def test_little_less_friction_takes_little_more_time() -> None:
     assert lasts[1] == pytest.approx(lasts[0], rel=0.03)
 
 
+def test_given_modes_are_compared_where_their_plan_takes_far_longer() -> None:
+    """The modes and poses of a plan of 0.094 s lead the solver to one of 0.37 s by themselves."""
+    problem = scenes.detouring()
+    z = np.array([-0.03378038, 0.04124561, 2.36886814, 2.37978117, 1.58346998])
+    (plan,) = plan_phases(problem, problem.phases[1:], z, PlanOptions(), only_begin=True)
+    assert plan.motion.duration < 0.1
+
+
 def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:
     z, v = stages[0].points.nodes[0]
     for stage in stages:

@@ -27,7 +27,7 @@ from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
-from ..problem.definition import End, Goal, Phase, Problem, Until
+from ..problem.definition import End, Goal, Problem, Until
 from .edge_plans import (
     CoarsePlan,
     Lost,
@@ -53,8 +53,6 @@ STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
 GAIN = 0.998  # largest ratio of durations that counts as a gain
 INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-AGREES = 1 + 2e-3  # ratio of a plan of printed phases to the coarse ones of the edges, above which
-# another initial guess is tried
 TRIED = 6  # most routes without a plan, beyond those asked for
 BEYOND = 1.1  # largest estimate of a route over that of the best one
 NEARBY = 30  # most places of `find_first`
@@ -352,21 +350,16 @@ class RoutePlanner:
         planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
         if isinstance(planned, Lost):
             return planned
-        found = [pair for part in planned for pair in part.phases]
-        reached = sum(part.duration for part in planned)
-        before: tuple[Phase, ...] = ()
-        if self.before:
-            before, reached = self.before.problem.phases, self.before.duration + reached
-        best: Plan | str = ""
+        found = [pair for part in planned for pair in part]
+        before = self.before.problem.phases if self.before else ()
+        plan: Plan | str = ""
         # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
         for guesses in (True, False) if alike else (False,) if slow else (False, True):
             phases = (*before, *list_printed(scene, found, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
-            if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
-                best = plan
-            if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
+            if isinstance(plan, Plan):
                 break
             if isinstance(plan, Lost) and alike:
                 numbers = [k - len(before) for k in plan.phases if k > len(before)]
@@ -375,7 +368,7 @@ class RoutePlanner:
                     # go through phases 18 and 19 of the first one.
                     plan.edges = self._find_lost(route, numbers)
                     break
-        return best
+        return plan
 
     def _find_lost(self, route: Route, phases: Sequence[int]) -> tuple[Edge, ...]:
         """Edges of a route that phases without a plan belong to.

@@ -63,16 +63,10 @@ class CoarsePlan(NamedTuple):
     begun: list[PhasePlan[TimeMotion]]
 
 
-class PartPlan(NamedTuple):
-    """The plan of a part of a route."""
-
-    duration: float  # [s]
-    # its phases with pinned landings, and the motions of those over time
-    phases: list[tuple[Phase, TimeMotion | None]]
-
-
 RoutePart = Sequence[tuple[Edge, CoarsePlan | None]]
 """Edges of a route, with plans of those through cells."""
+PartPlan = list[tuple[Phase, TimeMotion | None]]
+"""Planned phases of a part of a route, with pinned landings, and the motions of those over time."""
 
 
 def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
@@ -232,8 +226,7 @@ def plan_part(
         elif len(edge.steps) == 1 and not edge.in_cell:
             borders[len(owners) - 1] = edge
     single = replace(problem, phases=tuple(make_phases(problem, steps)), goals=())
-    planning, duration = Planning(single, (), options.roughen(), ()), 0.0
-    phases = list[tuple[Phase, TimeMotion | None]]()
+    planning, phases = Planning(single, (), options.roughen(), ()), PartPlan()
     try:
         with unadvised(), name_source(problem.source):
             for block in split_blocks(single):
@@ -243,7 +236,7 @@ def plan_part(
                     block = (_aim(block[0], start, borders[block[0].index]),)
                 if runs_along_curves(block, options):
                     chain = trace_block(planning, block, start)
-                    duration += chain.estimate(problem.epsilon)
+                    chain.estimate(problem.epsilon)  # An error where no motion keeps the limits.
                     phases += [(phase, None) for phase in block]
                     made = BlockPlan(block, start, [], chain)
                     planning = replace(planning, blocks=(*planning.blocks, made))
@@ -253,7 +246,6 @@ def plan_part(
                     known = BlockPlan(block, start, list(guess), None, coarse=True)
                 planning = plan_next(planning, known, report, coarse=True)
                 for phase, plan in zip(block, planning.blocks[-1].plans, strict=True):
-                    duration += plan.motion.duration
                     motion = cast(TimeMotion, plan.motion)
                     phases.append((pin_landing(phase, end_of(plan)[0]), motion))
     except (WholearmError, np.linalg.LinAlgError) as error:
@@ -263,7 +255,7 @@ def plan_part(
         lost = Lost(f"{describe_steps(tried)}: {reason}")
         lost.phases = [len(phases) + 1]
         return lost
-    return PartPlan(duration, phases)
+    return phases
 
 
 def pin_landing(phase: Phase, z: Array) -> Phase:
