@@ -24,8 +24,18 @@ from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import describe_pose, find_tied, tangent_basis
 from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, is_inside, list_ends
-from ...mechanics.dynamics import Directions, close_contacts, force_rows, metric_weights
+from ...mechanics.dynamics import (
+    ONE,
+    A,
+    B,
+    Directions,
+    close_contacts,
+    force_rows,
+    inverse,
+    metric_weights,
+)
 from ...mechanics.limits import SPEED, make_limits
+from ...mechanics.path_limits import find_slack_rows
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
 from ..path_domain.path_motion import PathMotion
@@ -403,53 +413,37 @@ class PathMargin(NamedTuple):
 def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> PathMargin:
     """Largest margin along a path, by a linear programme; if `paced` also a speed profile.
 
-    Unknowns are the squared speed b at the nodes, contact forces c in the intervals, and the
-    margin. Friction is against the path; viscous friction and limits of speeds are neglected.
+    Unknowns are the squared speed b at the nodes, and the margin. Friction is against the path;
+    viscous friction and limits of speeds are neglected.
     """
     from scipy.optimize import linprog
 
     formation, scene = outline.formation, outline.formation.scene
     dz, middles = np.diff(outline.z, axis=0), (outline.z[1:] + outline.z[:-1]) / 2
     runs = np.sqrt(dz**2 @ metric_weights(scene))[:, None]
-    z_s, m, k = dz / runs, len(dz), np.arange(len(dz))
+    z_s, m = dz / runs, len(dz)
     z_ss = np.gradient(z_s, np.cumsum(runs) - runs[:, 0] / 2, axis=0)
     kinematics = formation.evaluate(middles, z_s)
-    Xi = np.where(np.einsum("nij,nj->ni", kinematics.A_t, z_s) < 0, -1.0, 1.0)
-    sigma = np.where(z_s[:, 3:] < 0, -1.0, 1.0)
-    G = force_rows(formation, kinematics, Directions(Xi, sigma))
-    force, width = scene.scales.force, G.shape[1]
-    size = m + 1 + m * width + 1
-    # M5 z'' - G^T c, with z'' = z_s s'' + z_ss b.
-    drive = np.zeros((m, 5, size))
-    mass, slope = scene.mass_diagonal * scene.scales.speed**2, z_s / (2 * runs)
-    drive[k, :, k], drive[k, :, k + 1] = mass * (z_ss / 2 - slope), mass * (z_ss / 2 + slope)
-    columns = m + 1 + k[:, None] * width + np.arange(width)
-    drive[k[:, None], :, columns] = -force * G
-    units = force * np.array([1.0, 1.0, scene.scales.length])
-    y, offset = np.zeros((m, width + 2, size)), np.zeros((m, width + 2))
-    y[k[:, None], np.arange(width), columns] = force
-    y[:, width:], offset[:, width:] = drive[:, 3:], scene.dry[3:] * sigma
+    forces = inverse(formation, middles, z_s, z_ss, Directions.of(kinematics, z_s), kinematics)
     limits = make_limits(formation, epsilon).without(SPEED)
-    sides, signs, bounds = limits.sides
-    scales = signs / limits.scales[sides]
-    slopes = limits.rows[sides, :-2] * scales[:, None]
-    rows = -(slopes @ y)
+    slack = find_slack_rows(limits, forces, z_s[:, 3:])
+    # In the intervals, s'' and s'^2 of b over the scene's squared speed; the margin is the last.
+    nodes, size = scene.scales.speed**2 * np.eye(m + 1, m + 2), m + 2
+    motion = np.stack([np.diff(nodes, axis=0) / (2 * runs), (nodes[1:] + nodes[:-1]) / 2], axis=1)
+    rows = -(slack[..., [A, B]] @ motion)
     rows[..., -1] = 1.0
-    inequalities = rows.reshape(-1, size), (offset @ slopes.T - scales * bounds).ravel()
-    equal = (drive[:, :3] / units[:, None]).reshape(-1, size)
-    equal_to = np.tile(scene.applied_force[:3] / units, m)
-    free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
-    inside = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0), *free]  # the largest b
+    inequalities = rows.reshape(-1, size), slack[..., ONE].ravel()
+    inside = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0)]  # the largest b
 
     def maximise(gain: Array, least: float | None) -> Any:
         every = [*inside, (least, 1.0)]
-        return linprog(-gain, *inequalities, equal, equal_to, every, method="highs")
+        return linprog(-gain, *inequalities, bounds=every, method="highs")
 
     answer = maximise(np.eye(size)[-1], None)
     if answer.status != 0:
         return PathMargin(-np.inf)
     shares = np.abs(answer.ineqlin.marginals).reshape(m, -1).sum(axis=0)
-    totals = np.bincount(limits.owners[sides], shares)
+    totals = np.bincount(limits.owners[limits.sides[0]], shares)
     critical = limits.limits[int(totals.argmax())]
     margin, profile = float(answer.x[-1]), None
     # A fast one may lose half of a positive margin, and a little of a negative one.
@@ -460,8 +454,11 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
         slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
         t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
         length = np.append(0.0, np.cumsum(runs))
-        forces = fast.x[m + 1 : -1].reshape(m, width)
-        profile = PathSpeed(t, length / length[-1], v / length[-1], forces)
+        c = (
+            forces.of_c[..., ONE]
+            + (forces.of_c[..., [A, B]] @ (motion @ fast.x)[..., None])[..., 0]
+        )
+        profile = PathSpeed(t, length / length[-1], v / length[-1], c / scene.scales.force)
     return PathMargin(margin, critical.kind, critical.part, profile)
 
 
