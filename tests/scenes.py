@@ -319,28 +319,6 @@ def turning() -> Problem:
 
 
 @cache
-def detouring() -> Problem:
-    """A pentagon in contact modes from which the solver may get to a plan four times as long."""
-    return read_lines("""
-        epsilon = 0.055
-        object.mass = 0.22
-        object.vertices = [[0, 0], [0.06, 0], [0.085, 0.035], [0.045, 0.075], [-0.005, 0.05]]
-        fingers.1 = {base = [0.0743, -0.009779], length = 0.1369, radius = 0.004889,
-            inertia = 0.005259, viscous = 0.01064, dry = 0.01076, torque_limit = 2.151}
-        fingers.2 = {base = [-0.0743, -0.009779], length = 0.1369, radius = 0.004889,
-            inertia = 0.005259, viscous = 0.01064, dry = 0.01076, torque_limit = 2.151}
-        friction = {palm = 0.05, finger1 = 0.05, finger2 = 0.05}
-        start = {flush = 0, x = 0.015}
-        phases = [{contacts = ["v0-palm", "v1-palm", "v2-finger1", "v4-finger2"],
-            until = {x = 0.01}}, {contacts = ["v4-palm", "v1-finger1", "v2-finger2"],
-            until = {contact = "v0-finger1", x = 0.00245673267}, guess = [
-            {t = 0.03595, x = -0.0215248, phi_deg = 129.47072, signs = "+-- --"},
-            {t = 0.07190, x = 0.00024108, phi_deg = 115.12488, signs = "+-- --"},
-            {t = 0.09446, x = 0.00245673, phi_deg = 118.36311, signs = "+++ --"}]}]
-    """)
-
-
-@cache
 def reversing() -> Problem:
     """A decagon that leaves a border where its motion turns back."""
     return read_lines("""

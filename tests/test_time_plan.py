@@ -37,6 +37,7 @@ from wholearm import (
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
+from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weights
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.blocks import ImpactSequence
@@ -301,7 +302,18 @@ def test_little_less_friction_takes_little_more_time() -> None:
 
 def test_given_modes_are_compared_where_their_plan_takes_far_longer() -> None:
     """The modes and poses of a plan of 0.094 s lead the solver to one of 0.37 s by themselves."""
-    problem = scenes.detouring()
+    corners = np.array([[0.0, 0.0], [0.06, 0.0], [0.085, 0.035], [0.045, 0.075], [-0.005, 0.05]])
+    table = tomllib.loads(write_template("pentagon", vertices=corners, mass=0.22))
+    modes = [
+        {"t": 0.03595, "x": -0.0215248, "phi_deg": 129.47072, "signs": "+-- --"},
+        {"t": 0.07190, "x": 0.00024108, "phi_deg": 115.12488, "signs": "+-- --"},
+        {"t": 0.09446, "x": 0.00245673, "phi_deg": 118.36311, "signs": "+++ --"},
+    ]
+    phase = {"contacts": ["v4-palm", "v1-finger1", "v2-finger2"], "guess": modes}
+    table["phases"].append(phase | {"until": {"contact": "v0-finger1", "x": 0.00245673267}})
+    for finger, x in (("1", 0.0743), ("2", -0.0743)):
+        table["fingers"][finger]["base"][0] = x
+    problem = build_problem(table)
     z = np.array([-0.03378038, 0.04124561, 2.36886814, 2.37978117, 1.58346998])
     (plan,) = plan_phases(problem, problem.phases[1:], z, PlanOptions(), only_begin=True)
     assert plan.motion.duration < 0.1
