@@ -15,9 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.document import fixed
 from ..contacts.elemental import parse_contact
 from ..results.trajectory import Trajectory
@@ -156,7 +155,7 @@ def trace_link(finger: Finger, angle: float) -> Array:
     return np.asarray(centres + finger.radius * np.column_stack([np.cos(turns), np.sin(turns)]))
 
 
-def choose_snapshots(trajectory: Trajectory) -> NDArray[np.int64]:
+def choose_snapshots(trajectory: Trajectory) -> Numbers:
     """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
     starts = trajectory.phase_starts
     parts = np.ones(len(starts) - 1, dtype=int)

@@ -21,16 +21,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..common.arrays import Array
-from ..contacts.closing import (
-    ClosedFinger,
-    Flags,
-    Numbers,
-    close_fingers,
-    first_contact,
-    lower,
-    place_corners,
-)
+from ..common.arrays import Array, Flags, Numbers
+from ..contacts.closing import ClosedFinger, close_fingers, first_contact, lower, place_corners
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 

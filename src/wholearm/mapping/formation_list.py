@@ -12,17 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
-from ..contacts.closing import (
-    ClosedFinger,
-    Numbers,
-    close_fingers,
-    contact_table,
-    describe_obstacle,
-    lower,
-)
+from ..contacts.closing import ClosedFinger, close_fingers, contact_table, describe_obstacle, lower
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
@@ -32,7 +25,7 @@ from ..mechanics.dynamics import metric_weights
 from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
-from ..scene.model import TURN, Polygon, Scene, check_place
+from ..scene.model import PLACE, TURN, Polygon, Scene
 from .borders import (
     Track,
     Window,
@@ -94,7 +87,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
     corners = [np.array(pose, dtype=float) for pose in poses]
     for x, phi in corners:
-        check_place(problem.scene, "route", float(x))
+        PLACE.check("route", float(x), "m", problem.scene)
         TURN.check("route", math.degrees(phi), "degrees")
     near = tolerance(problem.scene)
     for one, two in pairwise(corners):

@@ -18,9 +18,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Flags, sort_unique
 from ..scene.model import Scene
 from .plan_record import ModeSpan
 from .torque import TorqueProfile
@@ -186,7 +185,7 @@ class HeldMotion:
             t = np.append(t, self.end + sort_unique(self.dwell.breaks[[0, -2, -1]]))
         return t, self._evaluate(t, np.arange(len(t)) >= count)
 
-    def _evaluate(self, t: Array, held: NDArray[np.bool_]) -> Samples:
+    def _evaluate(self, t: Array, held: Flags) -> Samples:
         """Samples, of which some are those of the dwell."""
         samples = self.motion.evaluate(np.clip(t - self.begin, 0.0, self.motion.duration))
         if self.pause is not None:
