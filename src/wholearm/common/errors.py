@@ -111,14 +111,14 @@ class InputError(WholearmError):
 
 
 @contextmanager
-def name_source(source: str) -> Iterator[None]:
-    """Give the source to an `InputError` from inside the block that does not know its own."""
+def name_source(source: str = "", prefix: str = "") -> Iterator[None]:
+    """Give source and prefix of the key to an `InputError` from inside that has no source."""
     try:
         yield
     except InputError as error:
-        if error.source or not source:
+        if error.source or not (source or prefix):
             raise
-        raise InputError(source, error.key, error.problem) from None
+        raise InputError(source, prefix + error.key, error.problem) from None
 
 
 @contextmanager

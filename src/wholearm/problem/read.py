@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product, zip_longest
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation, describe, find_touching
 from ..scene.model import FRICTION as COEFFICIENTS
-from ..scene.model import PLACE, TURN, Finger, Friction, Polygon, Scene, check_place, check_ranges
+from ..scene.model import PLACE, TURN, Finger, Friction, Polygon, Scene, check_ranges
 from .definition import (
     CONTACT,
     GROUPS,
@@ -54,7 +54,6 @@ from .definition import (
     spread_widths,
 )
 
-_T = TypeVar("_T")
 Table = Mapping[str, Field]
 """Keys of a table by name."""
 
@@ -174,10 +173,8 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
     if not isinstance(table, Mapping) or not table:
         text = "the trajectory does not hold its problem's tables"
         raise InputError(source, "meta.problem", text)
-    try:
+    with name_source(source, "meta.problem."):
         return build_problem(table)
-    except InputError as error:
-        raise InputError(source, f"meta.problem.{error.key}", error.problem) from None
 
 
 def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
@@ -208,7 +205,7 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
 
     InputError if `x` [m], of the centroid, is out of its range, or a finger does not reach.
     """
-    check_place(scene, "start.x", x)
+    PLACE.check("start.x", x, "m", scene)
     q = place_flush(scene, flush, x)
     try:
         z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
@@ -226,11 +223,11 @@ def read_phase(scene: Scene, index: int, given: object) -> Phase:
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
-    formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
+    with name_source(prefix=f"{key}.contacts"):
+        formation = read_formation(scene, names)
     end = End(PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
-    until = Until()
-    if "until" in entry:
-        until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
+    with name_source(prefix=f"{key}.until"):
+        until = read_until(scene, entry["until"]) if "until" in entry else Until()
     guess = _read_guess(formation, entry["guess"], f"{key}.guess") if "guess" in entry else None
     return Phase(index, formation, until, end, entry.get("settle"), guess)
 
@@ -250,7 +247,7 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         )
         if t <= (modes[-1].t if modes else 0.0):
             raise InputError("", f"{name}.t", f"{t:g} given; allowed is more than before")
-        check_place(scene, f"{name}.x", x)
+        PLACE.check(f"{name}.x", x, "m", scene)
         TURN.check(f"{name}.phi_deg", phi, "degrees")
         signs = entry["signs"]
         if not isinstance(signs, str) or not re.fullmatch(rf"[-+0]{{{count}}} [-+]{{2}}", signs):
@@ -309,14 +306,6 @@ def read_until(scene: Scene, given: object) -> Until:
     return Until(None, coordinate, value, tuple(others))
 
 
-def _at(key: str, read: Callable[[], _T]) -> _T:
-    """Run `read`, giving the key to an error that does not know its own."""
-    try:
-        return read()
-    except InputError as error:
-        raise InputError("", key, error.problem) from None
-
-
 def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
     if not isinstance(value, Mapping):
@@ -345,7 +334,7 @@ def check_problem(problem: Problem) -> None:
         value = field.read(getattr(problem, attribute), field.name)
         field.check(value, field.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
-    check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
+    PLACE.check("start.x", float(require_vector(problem.start, "start", 5)[0]), "m", problem.scene)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
@@ -377,7 +366,7 @@ def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
     else:
         _check_edge(scene, goal.flush, f"{key}.flush")
     if goal.x is not None:
-        check_place(scene, f"{key}.x", goal.x)
+        PLACE.check(f"{key}.x", goal.x, "m", scene)
 
 
 def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
@@ -447,7 +436,7 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
             raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
         value = require_number(target, key)
         if coordinate == "x":
-            check_place(scene, key, value)
+            PLACE.check(key, value, "m", scene)
         else:
             # Rounding in radians is no matter at the end of the range.
             TURN.check(key, round(math.degrees(value), 9), "degrees")
