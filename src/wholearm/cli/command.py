@@ -285,15 +285,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except WholearmError as error:
         _complain(str(error))
         return error.exit_status
-    except BrokenPipeError:
-        _silence_output()
-        return 1
     except OSError as error:
         # Files are written elsewhere, with errors of their own; this is the output.
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
-        _silence_output()
-        _complain(f"standard output: cannot be written: {error.strerror}")
+        # The interpreter would complain again, when it exits, about what cannot be written.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno != errno.EPIPE:
+            _complain(f"standard output: cannot be written: {error.strerror}")
         return 1
 
 
@@ -303,11 +302,6 @@ def _complain(text: str) -> None:
         print(f"wholearm: {text}", file=sys.stderr, flush=True)
     except OSError:
         pass  # nobody reads it
-
-
-def _silence_output() -> None:
-    """Keep the interpreter from complaining again, when it exits, about what cannot be written."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Parser(argparse.ArgumentParser):
