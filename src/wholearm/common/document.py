@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 import numpy as np
 
 
-def plain(value: Any) -> Any:
-    """`value` in plain containers for JSON, with None for NaN and infinity.
+def plain(value: Any, finite: bool = True) -> Any:
+    """`value` in plain containers for JSON, if `finite` with None for NaN and infinity.
 
     Of named tuples and dataclasses the properties that they name as `derived`, and all fields but
     those that a `repr` leaves out.
@@ -30,10 +30,10 @@ def plain(value: Any) -> Any:
     elif isinstance(value, Enum):
         value = value.value
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(item, finite) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [plain(item, finite) for item in value]
+    return None if finite and isinstance(value, float) and not math.isfinite(value) else value
 
 
 def restore(kind: Any, value: Any) -> Any:
