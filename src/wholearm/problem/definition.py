@@ -311,11 +311,6 @@ class Problem:
         return phase.settle
 
     @property
-    def is_settled(self) -> bool:
-        """Whether any end that comes to rest is held."""
-        return any(self.settles(phase) != 0 for phase in self.phases)
-
-    @property
     def gap(self) -> float:
         """By how much a contact may be open that closes at such an end [m]."""
         default = 3e-3 * self.scene.scales.length  # 0.1 mm of 35 mm

@@ -103,6 +103,10 @@ _PARTS = name_fields(
     declare("phases", kind=leave({"type": "array", "items": refer("phase")}), default=None),
 )
 TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
+_TABLES = {
+    "object": OBJECT, "finger": FINGER, "friction": FRICTION, "start": START,
+    "uncertainty": UNCERTAINTY, "goal": GOAL,
+}  # fmt: skip
 
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
@@ -522,11 +526,8 @@ def name_keys() -> dict[str, tuple[str, ...]]:
 
 def build_schema() -> dict[str, Any]:
     """The JSON Schema of problem files."""
-    tables = {
-        "object": OBJECT, "fingers": FINGERS, "finger": FINGER, "friction": FRICTION,
-        "start": START, "uncertainty": UNCERTAINTY, "goal": GOAL, "phase": PHASE, "until": UNTIL,
-        "mode": MODE,
-    }  # fmt: skip
+    tables = {"object": OBJECT, "fingers": FINGERS} | _TABLES
+    tables |= {"phase": PHASE, "until": UNTIL, "mode": MODE}
     definitions = {name: _describe(table) for name, table in tables.items()}
     smooth = {"required": ["end"], "properties": {"end": {"const": "smooth"}}}
     definitions["phase"]["anyOf"] = [{"required": ["until"]}, smooth]
@@ -558,18 +559,10 @@ def _describe(table: Table) -> dict[str, Any]:
 
 def write_page() -> str:
     """All keys of a problem file, as tables in Markdown."""
-    tables = {
-        "At the top": TOP,
-        "`[object]`": OBJECT,
-        "`[fingers.1]`, `[fingers.2]`": FINGER,
-        "`[friction]`": FRICTION,
-        "`[start]`": START,
-        "`[uncertainty]`": UNCERTAINTY,
-        "`[goal]`": GOAL,
-        "`[[phases]]`": PHASE,
-    }
+    titles = {name: f"`[{name}]`" for name in _TABLES} | {"finger": "`[fingers.1]`, `[fingers.2]`"}
+    tables = [("At the top", TOP), *((titles[name], table) for name, table in _TABLES.items())]
     parts = []
-    for title, table in tables.items():
+    for title, table in [*tables, ("`[[phases]]`", PHASE)]:
         lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
         for name, field in table.items():
             if name not in _PARTS:
