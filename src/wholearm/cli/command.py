@@ -463,11 +463,11 @@ def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def save_figure(path: str | None, function: str, result: Result) -> None:
-    """Draw a result by a function of the package, ``module:name``, if a file is given for it."""
+    """Draw a result by a function of `figures.result_figures`, if a file is given for it."""
     if path is not None:
-        module, name = function.split(":")
-        draw = getattr(import_module(f"wholearm.{module}"), name)
-        wholearm.plots.save(draw(result), path)
+        from ..figures import result_figures
+
+        wholearm.plots.save(getattr(result_figures, function)(result), path)
 
 
 def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
@@ -655,7 +655,7 @@ def _predict(options: argparse.Namespace) -> int:
     require_with(options, "torques", "speed")
     problem = read_problem(options)
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress)
-    save_figure(options.output, "figures.result_figures:draw_prediction", prediction)
+    save_figure(options.output, "draw_prediction", prediction)
     status = finish(options, prediction)
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
@@ -677,7 +677,7 @@ def _compare(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem = wholearm.load(options.problem)
     comparison = wholearm.compare(problem, options.files, show_progress)
-    save_figure(options.output, "figures.result_figures:draw_comparison", comparison)
+    save_figure(options.output, "draw_comparison", comparison)
     return finish(options, comparison, options.output)
 
 
@@ -718,7 +718,7 @@ def _robustness(options: argparse.Namespace) -> int:
         start=choose_workers(options),
         progress=show_progress,
     )
-    save_figure(options.figure, "figures.result_figures:draw_robustness", study)
+    save_figure(options.figure, "draw_robustness", study)
     return finish(options, study, output, options.figure, notes=notes)
 
 
@@ -777,7 +777,7 @@ def _save_map(
 
 
 def _map(options: argparse.Namespace) -> int:
-    poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
+    poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list]
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
     if phi and not 0 < phi[1] - phi[0] <= 360:
         raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
@@ -843,11 +843,9 @@ def _replay(options: argparse.Namespace) -> int:
     require_engine(options.engine)
     problem, plan, policy, notes = _load_replayed(options, options.json)
     _check_step(options, problem)
-    setting = Setting()
+    setting = Setting()._replace(**list_given(options, "softness"))
     if options.step is not None:
         setting = setting._replace(step=options.step / problem.scene.scales.time)
-    if options.softness is not None:
-        setting = setting._replace(softness=options.softness)
     arguments: dict[str, Any] = {"whole": options.whole, "setting": setting}
     arguments["progress"] = show_progress
     if policy is None:
@@ -936,11 +934,8 @@ def _sweep(options: argparse.Namespace) -> int:
     from ..problem.read import read_problem
 
     vary = read_vary(options.vary, options.samples)
-    parts = [
-        Path(options.problems[0]).stem,
-        *(re.sub(r"\W+", "_", name).strip("_") for name in vary),
-    ]
-    output = options.output or f"{'_'.join(parts)}.csv"
+    names = (re.sub(r"\W+", "_", name).strip("_") for name in vary)
+    output = options.output or f"{'_'.join([Path(options.problems[0]).stem, *names])}.csv"
     require_output(output, ".csv")
     require_output(options.figure)
     if options.figure is not None:
@@ -959,7 +954,7 @@ def _sweep(options: argparse.Namespace) -> int:
         progress=show_progress,
     )
     write_text(output, result.to_csv())
-    save_figure(options.figure, "figures.result_figures:draw_sweep", result)
+    save_figure(options.figure, "draw_sweep", result)
     return finish(options, result, output, options.figure)
 
 
@@ -971,14 +966,9 @@ def _sensitivities(options: argparse.Namespace) -> int:
         problem, _, _, notes = load_plan(options, options.plan, options.json)
         plan_options = wholearm.load_plan(options.plan).options
     result = wholearm.find_sensitivities(
-        problem,
-        plan_options,
-        options.of or (),
-        options.jobs,
-        show_progress,
-        not options.differences,
+        problem, plan_options, options.of, options.jobs, show_progress, not options.differences
     )
-    save_figure(options.output, "figures.result_figures:draw_sensitivities", result)
+    save_figure(options.output, "draw_sensitivities", result)
     return finish(options, result, options.output, notes=notes)
 
 
@@ -998,7 +988,7 @@ def _design(options: argparse.Namespace) -> int:
     )
     for plan, path in zip(result.plans, outputs, strict=True):
         wholearm.save(plan.problem, path)
-    save_figure(options.figure, "figures.result_figures:draw_search", result)
+    save_figure(options.figure, "draw_search", result)
     return finish(options, result, *outputs, options.figure)
 
 
