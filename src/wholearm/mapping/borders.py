@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -101,16 +101,14 @@ def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
     for phi, edge in window.flush_angles(scene):
         yield palm_track(scene, edge, phi, np.linspace(*window.x, samples))
     height = window.phi[1] - window.phi[0]
+    count = scene.polygon.n_vertices
     for low, high, vertex in window.bands(scene):
         places = np.linspace(low, high, max(3, round(samples * (high - low) / height)))
-        for finger in (0, 1):
-            for index in range(scene.polygon.n_vertices):
-                yield flush_track(scene, finger, index, vertex, places)
-                for branch in (-1.0, 1.0):
-                    yield _circle_track(scene, finger, index, None, branch, vertex, places)
-                    if scene.fingers[finger].radius > 0:
-                        for edge in ((index - 1) % scene.polygon.n_vertices, index):
-                            yield _circle_track(scene, finger, index, edge, branch, vertex, places)
+        for finger, index in product((0, 1), range(count)):
+            yield flush_track(scene, finger, index, vertex, places)
+            edges = ((index - 1) % count, index) if scene.fingers[finger].radius > 0 else ()
+            for branch, edge in product((-1.0, 1.0), (None, *edges)):
+                yield _circle_track(scene, finger, index, edge, branch, vertex, places)
 
 
 def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
