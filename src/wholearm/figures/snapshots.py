@@ -29,17 +29,12 @@ CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that 
 
 
 def draw_snapshot(
-    axes: Axes,
-    scene: Scene,
-    z: Array,
-    contacts: Sequence[str],
-    styles: Styles,
-    box: Array | None = None,
+    axes: Axes, scene: Scene, z: Array, contacts: Sequence[str], styles: Styles, box: Array
 ) -> list[Artist]:
     """Draw palm, links, object with numbered vertices, and contacts, on axes in m without a frame.
 
-    They show `box`, lower left and upper right corner, shape (2, 2) [m], or everything at the
-    configuration `z`, (5,). Returns palm, link 1, link 2, object, and one marker per contact.
+    They show a configuration, z (5,), within `box`: lower left and upper right corner, (2, 2) [m].
+    Returns palm, link 1, link 2, object, and one marker per contact.
     """
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="datalim")
@@ -52,7 +47,6 @@ def draw_snapshot(
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
         artists += axes.plot(*locate(scene, name, z[None]).point.T, marker, ms=6.5, **look)
-    box = measure_box(scene, z[None]) if box is None else box
     axes.set(xlim=box[:, 0], ylim=box[:, 1])
     scale = measure_scale(axes)
     corners = [parse_contact(name, scene) for name in contacts]
