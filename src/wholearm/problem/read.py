@@ -42,7 +42,6 @@ from .definition import (
     CONTACT,
     GROUPS,
     INDEX,
-    LENGTH,
     PARAMETERS,
     ROWS,
     End,
@@ -51,6 +50,7 @@ from .definition import (
     Phase,
     Problem,
     Until,
+    read_widths,
     spread_widths,
 )
 
@@ -58,10 +58,8 @@ Table = Mapping[str, Field]
 """Keys of a table by name."""
 
 
-_WIDTHS = {
-    field.name: replace(field, default=field.default * (LENGTH if field.unit == "m" else 1))
-    for field in PARAMETERS
-}
+_DEFAULTS = read_widths({})
+_WIDTHS = {field.name: replace(field, default=_DEFAULTS[field.name]) for field in PARAMETERS}
 OBJECT, FINGER, FRICTION, PHASE, GOAL = (
     name_fields(*keys_of(field).values()) for field in (Polygon, Finger, Friction, Phase, Goal)
 )
@@ -137,7 +135,7 @@ def read_problem(path: str) -> Problem:
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """The problem of a file's nested tables, or an `InputError` that names `source`."""
     with name_source(source):
-        check_keys(table, "", TOP)
+        _table(table, "", TOP)
         polygon = Polygon(**collect_keys(Polygon, _table(table["object"], "object", OBJECT)))
         fingers = _table(table["fingers"], "fingers", FINGERS)
         coefficients = _table(table["friction"], "friction", FRICTION)
@@ -314,20 +312,15 @@ def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
     if not isinstance(value, Mapping):
         raise InputError("", key, f"{value!r} is not a table")
-    check_keys(value, key, known)
-    return value
-
-
-def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
-    """Check that a table has what is required, and nothing unknown."""
-    prefix = f"{where}." if where else ""
-    for key in table:
-        if key not in known:
+    prefix = f"{key}." if key else ""
+    for name in value:
+        if name not in known:
             allowed = f"allowed are {', '.join(sorted(known))}"
-            raise InputError("", f"{prefix}{key}", f"unknown key; {suggest(key, known)}{allowed}")
-    for key in sorted(name for name, field in known.items() if field.required):
-        if key not in table:
-            raise InputError("", f"{prefix}{key}", "is missing")
+            raise InputError("", f"{prefix}{name}", f"unknown key; {suggest(name, known)}{allowed}")
+    for name in sorted(name for name, field in known.items() if field.required):
+        if name not in value:
+            raise InputError("", f"{prefix}{name}", "is missing")
+    return value
 
 
 @exclusive
@@ -382,7 +375,7 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
         if not isinstance(entry, Mapping):
             text = f"{entry!r} given; allowed is a table with flush or phi_deg, and x"
             raise InputError("", key, text)
-        check_keys(entry, key, GOAL)
+        _table(entry, key, GOAL)
         values = {name: GOAL[name].read(entry[name], f"{key}.{name}") for name in entry}
         if "phi_deg" in values:
             values["phi"] = math.radians(values.pop("phi_deg"))
