@@ -105,13 +105,9 @@ class Table(NamedTuple):
         """Aligned columns under their names."""
         forms, lines = self.forms, [self.heads, *self.cells[: self.most]]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        aligned = [f"{'>' if f else '<'}{width}" for f, width in zip(forms, widths, strict=True)]
         text = [self.title] if self.title else []
-        for line in lines:
-            padded = (
-                cell.rjust(width) if form else cell.ljust(width)
-                for cell, width, form in zip(line, widths, forms, strict=True)
-            )
-            text.append("  ".join(padded).rstrip())
+        text += ["  ".join(map(format, line, aligned)).rstrip() for line in lines]
         rest = len(self.rows) - len(self.rows[: self.most])
         return "\n".join([*text, *([f"... and {rest} more, see --json"] if rest else [])])
 
@@ -329,9 +325,6 @@ def _write(value: Any) -> str:
 
 def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
     """The first differences in words; `one` and `other` say where the values stand."""
-    shown, rest = (parts := list(found))[:3], parts[3:]
-    text = ", ".join(
-        f"{difference.key} ({difference.one} {one}, {difference.other} {other})"
-        for difference in shown
-    )
-    return text + (f", and {len(rest)} more" if rest else "")
+    texts = [f"{d.key} ({d.one} {one}, {d.other} {other})" for d in found]
+    more = [f"and {len(texts) - 3} more"] if texts[3:] else []
+    return ", ".join(texts[:3] + more)

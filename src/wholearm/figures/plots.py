@@ -101,11 +101,8 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
 
 def _scale_ticks(axes: Axes, factor: float) -> None:
     """Have the values at the ticks written times a factor."""
-
-    def show(y: float, _: object) -> str:
-        return f"{factor * y:.6g}".replace("-", "\u2212")
-
-    axes.yaxis.set_major_formatter(FuncFormatter(show))
+    scaled = FuncFormatter(lambda y, _: f"{factor * y:.6g}".replace("-", "\u2212"))
+    axes.yaxis.set_major_formatter(scaled)
 
 
 def draw_cones(

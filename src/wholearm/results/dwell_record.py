@@ -57,13 +57,11 @@ class TorqueChange:
         counts = [max(math.ceil(n), 1) for n in (lasts * self.decays.max()).tolist()]
         spans = zip(self.times[:-1], self.times[1:], counts, strict=True)
         breaks = np.concatenate([np.linspace(a, b, n + 1)[:-1] for a, b, n in spans])
-        breaks = np.append(breaks, self.duration)
-
-        def evaluate(t: Array) -> Array:
-            return self.before + self.share(t)[:, None] * (self.after - self.before)
-
+        breaks, change = np.append(breaks, self.duration), self.after - self.before
         # Pieces are as long as the shortest lag at most.
-        return TorqueProfile.fit(breaks, evaluate, 6 if fades else 1)
+        return TorqueProfile.fit(
+            breaks, lambda t: self.before + self.share(t)[:, None] * change, 6 if fades else 1
+        )
 
 
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
