@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     from ..benchmark.study import Study
     from ..common.document import Result
     from ..planning.replay_check import TorqueTable
-    from ..results.report import Report
-    from ..simulation.events import Simulation
-    from ..verification.free import FreeReport
 
 
 TOPICS = {
@@ -585,6 +582,7 @@ def _verify(options: argparse.Namespace) -> int:
             raise InputError("", key, "does not go with --free")
     policy, notes = None, dict[str, list[str]]()
     torques: wholearm.Trajectory | wholearm.TorqueProfile
+    report: wholearm.Report | wholearm.FreeReport
     if not _is_table(options.torques):
         problem, torques, policy, notes = load_plan(options, options.torques, options.json)
     elif options.policy is not None:
@@ -597,7 +595,7 @@ def _verify(options: argparse.Namespace) -> int:
 
         check_phases(problem)
     if policy is not None and isinstance(torques, wholearm.Trajectory):
-        report: Report | FreeReport = wholearm.verify_policy(problem, torques, policy, **values)
+        report = wholearm.verify_policy(problem, torques, policy, **values)
     elif options.free:
         report = wholearm.verify_free(problem, torques, progress=show_progress, **values)
     else:
@@ -634,7 +632,7 @@ def _plot(options: argparse.Namespace) -> int:
     return finish(options, None, options.output)
 
 
-def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> Simulation | None:
+def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.Simulation | None:
     """Simulate the torques of a trajectory; `simulator` is told or free, or None for nothing."""
     if simulator is None:
         return None
