@@ -206,12 +206,12 @@ class Brief:
 class Drawn(Brief):
     """A motion or a map, which is a picture in notebooks: SVG under its line."""
 
+    drawn_by = "plots", "force_margins"  # module and function of `figures`
+
     def _repr_html_(self) -> str:
-        name, function = "plots", "force_margins"
-        if hasattr(self, "crossings"):
-            name, function = "map_figure", "draw_map"
         # Figures stand on everything else, so that nothing loads them before it is drawn.
-        figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
+        module = import_module(f"wholearm.figures.{self.drawn_by[0]}")
+        figure = getattr(module, self.drawn_by[1])(self)
         return f"<p>{escape(repr(self))}</p>{write_svg(figure)}"
 
 

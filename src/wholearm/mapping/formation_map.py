@@ -87,6 +87,8 @@ class Crossing:
 class FormationMap(Drawn):
     """The cells, borders and crossings of a window of the (x, phi) plane."""
 
+    drawn_by = "map_figure", "draw_map"
+
     problem: Problem
     x: Array  # x, phi (n_x,) and (n_phi,) [m] and [rad]: grid
     phi: Array
@@ -174,9 +176,11 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     points, z, owner = points[closed], z[closed], owner[closed]
     labels = np.array([piece.label for piece in pieces])[owner]
     flush = np.array([piece.track.flush is not None for piece in pieces])[owner]
+    on_palm = [piece.track.flush is not None and piece.track.flush[0] is None for piece in pieces]
+    along = ["x" if palm else "phi" for palm in on_palm]
     flags = np.zeros((3, len(z)), dtype=bool)
     if flush.any():
-        rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
+        rows = np.array([ROWS[name] for name in along])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
         kinematics = evaluate_each(scene, chosen, z[flush])
         weights = np.sqrt(metric_weights(scene))
@@ -192,15 +196,9 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     for index, piece in enumerate(pieces):
         mine = owner == index
         contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
-        curve = _along(piece), points[mine], z[mine]
+        curve = along[index], points[mine], z[mine]
         borders.append(Border(contacts, piece.track.flush, *curve, *flags[:, mine]))
     return borders
-
-
-def _along(piece: Piece) -> str:
-    """The coordinate that increases along a piece."""
-    flush = piece.track.flush
-    return "x" if flush is not None and flush[0] is None else "phi"
 
 
 def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:

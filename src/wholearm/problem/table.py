@@ -8,6 +8,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -142,16 +143,12 @@ def _find_start(problem: Problem) -> dict[str, Any] | None:
     """The table of the start, or None if no edge is flush there or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
     units = np.array([scene.scales.length, scene.scales.length, 1.0])
-    try:
-        closed = [close_finger(scene, q, finger) for finger in (0, 1)]
-    except InputError:
-        return None
-    if np.abs(problem.start[3:] - closed).max() > 1e-9:
-        return None
     for edge in range(scene.polygon.n_vertices):
-        flush = place_flush(scene, edge, float(q[0]))
-        if (np.abs(flush - q) <= 1e-12 * units).all():
-            return {"flush": edge, "x": float(q[0])}
+        if (np.abs(place_flush(scene, edge, float(q[0])) - q) <= 1e-12 * units).all():
+            with suppress(InputError):
+                closed = [close_finger(scene, q, finger) for finger in (0, 1)]
+                if np.abs(problem.start[3:] - closed).max() <= 1e-9:
+                    return {"flush": edge, "x": float(q[0])}
     return None
 
 
