@@ -317,8 +317,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
-        text = message.removeprefix("argument ")
-        raise InputError("", "", f"{text}; see {self.prog} --help")
+        raise InputError("", "", f"{message.removeprefix('argument ')}; see {self.prog} --help")
 
 
 def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:

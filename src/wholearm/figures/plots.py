@@ -182,8 +182,7 @@ def draw_simulation(margins: Axes, torques: Axes, simulation: Simulation, epsilo
     t = simulation.t
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
-    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
-    lines[0].set_label("simulated")
+    margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)[0].set_label("simulated")
     other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
     for index, look in enumerate((SIMULATED, SIMULATED | other)):
         label = f"simulated {index + 1}"

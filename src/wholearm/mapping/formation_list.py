@@ -238,8 +238,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
         try:
             for contacts, until in steps:
                 start = end
-                phase = Phase(index + len(walked), Formation(scene, contacts), until)
-                end = find_end(phase, start)
+                end = find_end(Phase(index + len(walked), Formation(scene, contacts), until), start)
                 moved = metric_weights(scene) @ (end - start) ** 2
                 if moved < (STILL * scene.scales.length) ** 2:
                     text = f"{until} holds already at {describe_pose(start)}"

@@ -80,8 +80,7 @@ def _prepare_scene(
             artists.append(axes.text(x, y, str(k), **look))
         pressing = np.flatnonzero(presses[row]).tolist()
         for k in pressing:
-            cone = Polygon(cones[row, k], fc=colours[k], alpha=0.2, lw=0)
-            artists.append(axes.add_artist(cone))
+            artists.append(axes.add_artist(Polygon(cones[row, k], fc=colours[k], alpha=0.2, lw=0)))
         for k in pressing:
             arrow = _trace_arrow(points[row, k], arrows[row, k], 0.018 * size)
             artists.append(style.add_line(axes, arrow, color=colours[k], lw=1.8))
