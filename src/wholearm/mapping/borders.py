@@ -84,7 +84,12 @@ class Piece:
 
 def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
     """Labels of n poses inside cells, shape (n, 6); `NOWHERE` where a finger cannot close."""
-    return label_closed(close_fingers(scene, x, phi), lower(scene, phi)[1])
+    return label_inside(scene, close_fingers(scene, x, phi))
+
+
+def label_inside(scene: Scene, closed: ClosedFinger) -> Numbers:
+    """Labels of closed poses inside cells, shape (n, 6)."""
+    return label_closed(closed, lower(scene, closed.z[:, 2])[1])
 
 
 def label_closed(closed: ClosedFinger, vertex: int | Numbers) -> Numbers:

@@ -15,7 +15,7 @@ import numpy as np
 from ..common.arrays import Array, Numbers
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
-from ..contacts.closing import ClosedFinger, close_fingers, contact_table, describe_obstacle, lower
+from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
@@ -32,7 +32,7 @@ from .borders import (
     cut,
     flush_track,
     label_cells,
-    label_closed,
+    label_inside,
     name_contacts,
     palm_track,
 )
@@ -444,12 +444,10 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
         points = start + s[:, None] * (stop - start)
         return points[:, 0], points[:, 1]
 
-    def label(_: Array, phi: Array, closed: ClosedFinger) -> Numbers:
-        return label_closed(closed, lower(scene, phi)[1])
-
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    return Leg(Track(pose, label, places, np.inf), 0.0, 1.0, share)
+    track = Track(pose, lambda x, phi, closed: label_inside(scene, closed), places, np.inf)
+    return Leg(track, 0.0, 1.0, share)
 
 
 def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:

@@ -17,14 +17,7 @@ from ..common.arrays import Array, Flags, Numbers, interpolate
 from ..common.document import Drawn
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..contacts.closing import (
-    close_fingers,
-    contact_table,
-    evaluate_each,
-    find_reach,
-    group_alike,
-    lower,
-)
+from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_alike
 from ..contacts.elemental import Contact
 from ..contacts.formation import Kinematics
 from ..geometry.curve import solve_tangent
@@ -43,7 +36,7 @@ from .borders import (
     Window,
     cut,
     label_cells,
-    label_closed,
+    label_inside,
     list_tracks,
     name_contacts,
 )
@@ -318,10 +311,9 @@ def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
     """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
     shape, places = (len(phi), len(x)), [part.ravel() for part in np.meshgrid(x, phi)]
     closed = close_fingers(scene, *places)
-    labels = label_closed(closed, lower(scene, places[1])[1])
     codes = np.where(closed.obstacle > 0, 2 * closed.obstacle - 1 + np.array([0, 1]), 0)
     obstacle = np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1])
-    return labels.reshape(*shape, 6), obstacle.reshape(shape)
+    return label_inside(scene, closed).reshape(*shape, 6), obstacle.reshape(shape)
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
