@@ -26,16 +26,7 @@ from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
 from ..scene.model import PLACE, TURN, Polygon, Scene
-from .borders import (
-    Track,
-    Window,
-    cut,
-    flush_track,
-    label_cells,
-    label_inside,
-    name_contacts,
-    palm_track,
-)
+from .borders import Track, Window, cut, flush_track, label_inside, name_contacts, palm_track
 
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
 _COMMENTS = 31  # Column of the comments
@@ -392,7 +383,7 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
             # Each place has to be within `NEAR` of where the contact touches.
             x, phi = leg.track.pose(np.linspace(first, last, 9))
             poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
-            near = label_cells(scene, *poses.T).reshape(9, len(box), -1)[..., column]
+            near = label_inside(scene, close_fingers(scene, *poses.T))[:, column].reshape(9, -1)
             if (near == contacts[k - 1]).any(axis=1).all():
                 contacts[k : k + int(again[0])] = contacts[k - 1]
     kept: list[Span] = []

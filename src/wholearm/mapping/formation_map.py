@@ -30,16 +30,7 @@ from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..planning.lower_bound import GIVE
 from ..problem.definition import ROWS, Problem
 from ..scene.model import Scene
-from .borders import (
-    NOWHERE,
-    Piece,
-    Window,
-    cut,
-    label_cells,
-    label_inside,
-    list_tracks,
-    name_contacts,
-)
+from .borders import NOWHERE, Piece, Window, cut, label_inside, list_tracks, name_contacts
 from .formation_list import trace_problem
 
 WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # travel inside a cell: x, phi
@@ -147,9 +138,10 @@ def build_map(
     ends = np.linspace(*window.x, 25), np.linspace(*window.phi, 25)
     middles = np.meshgrid(*((values[1:] + values[:-1]) / 2 for values in ends))
     places = np.column_stack([part.ravel() for part in middles])
-    inside = label_cells(scene, *places.T)
-    places, inside = places[inside[:, 0] != NOWHERE], inside[inside[:, 0] != NOWHERE]
-    z = close_fingers(scene, *places.T).z
+    closed = close_fingers(scene, *places.T)
+    inside = label_inside(scene, closed)
+    free = inside[:, 0] != NOWHERE
+    places, inside, z = places[free], inside[free], closed.z[free]
     directions = _check_cells(problem, inside[:, [0, 2, 4]], z, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
