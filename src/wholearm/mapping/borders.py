@@ -287,8 +287,6 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     pieces, first = [], 0
     for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
         rows, first = slice(first, first + size), first + size
-        if (labels[rows] == NOWHERE).all():
-            continue
         start, held = float(places[rows][0]), labels[rows][0]
         parts = []
         for before, after, following in changes.get(index, ()):
