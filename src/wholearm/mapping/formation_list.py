@@ -476,13 +476,10 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
         return np.asarray(np.nan_to_num((np.abs(points - pose) / near).max(axis=1), nan=np.inf))
 
     low, high = float(track.places[0]), float(track.places[-1])
-    phi = float(np.clip(pose[1], low, high))
-    straight = float(off(np.array([phi]))[0])
-    if straight < 1:
-        return phi, straight
-    places = np.linspace(low, high, PLACES)
+    places = np.append(np.clip(pose[1], low, high), np.linspace(low, high, PLACES))
     away = off(places)
-    k = int(away.argmin())
+    # That of the same phi, if it is near.
+    k = 0 if away[0] < 1 else 1 + int(away[1:].argmin())
     return float(places[k]), float(away[k])
 
 
