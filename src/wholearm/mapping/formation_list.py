@@ -86,20 +86,20 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             text = f"two poses at {describe_pose(one)} are the same place"
             raise InputError("", "route", text)
     z, start, corners, notes = _begin(problem, corners)
-    here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
-    origin = here
-    for leg, there in enumerate(corners):
+    origin, stretches = z[[0, 2]], list[Stretch]()
+    for leg, there in enumerate(corners, start=1):
+        here = z[[0, 2]]
         note = describe_miss(problem.scene, here, there)
         try:
             walked = walk_leg(problem, len(stretches), z, here, there)
         except InputError as error:
-            text = f"leg {leg + 1} {error.problem}" + (f"; {note}" if note else "")
+            text = f"leg {leg} {error.problem}" + (f"; {note}" if note else "")
             raise InputError("", "route", text) from None
         if note:
-            notes.append(f"leg {leg + 1} goes through cells: {note}")
-        for (contacts, until), end in walked:
+            notes.append(f"leg {leg} goes through cells: {note}")
+        for k, ((contacts, until), end) in enumerate(walked):
             stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
-            before = stretches[-1] if stretches and legs[-1] != leg else None
+            before = stretches[-1] if stretches and k == 0 else None
             # On a border a leg may continue the one before; a reversal is a new phase.
             if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
                 runs = (before.stop - before.start) * (stretch.stop - stretch.start)
@@ -108,9 +108,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
                     stretches.pop()
                     stretch = replace(stretch, contacts=before.contacts, start=before.start)
             stretches.append(stretch)
-            legs.append(leg)
             z = end
-        here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
     stretches[0] = replace(stretches[0], start=origin)
     route = Route(stretches)
