@@ -35,8 +35,8 @@ def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Pro
 def rocking(scale: float = 1.0) -> TorqueProfile:
     """Finger 1 pushes the box until it slides, eases off until it sticks, and does so again."""
     share = np.array([0.0, 1.4, 1.3, 0.35, 0.35, 1.5, 0.4])
-    tau = np.column_stack([0.14 * scale * share, np.full(7, 1e-3)])
-    return TorqueProfile.join_rows(np.arange(7) / 10, tau)
+    rows = [np.arange(7) / 10, 0.14 * scale * share, np.full(7, 1e-3)]
+    return TorqueProfile.join_rows(np.column_stack(rows))
 
 
 def fit_stages(torque: Callable[[float, int], Array], times: Sequence[float]) -> TorqueProfile:

@@ -12,7 +12,7 @@ import plane
 from rows import each
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
-from wholearm.common.arrays import Array
+from wholearm.common.arrays import Array, Numbers
 from wholearm.contacts import closing, elemental
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.mapping.borders import label_cells
@@ -303,7 +303,7 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
     assert np.isfinite(np.array(function(np.ones(5)))).all()
 
 
-def close(radius: float) -> tuple[Scene, closing.Numbers, Array, Array]:
+def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     """A hand with links that are just long enough: labels, poses, and the hand closed there."""
     scene = plane.make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)

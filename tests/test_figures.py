@@ -40,7 +40,7 @@ from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_each
 from wholearm.figures.map_figure import draw_map
 from wholearm.figures.plots import draw_torques, scale_margins
-from wholearm.figures.snapshots import choose_snapshots, draw_snapshot
+from wholearm.figures.snapshots import choose_snapshots, draw_snapshot, measure_box
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
@@ -210,7 +210,7 @@ def test_snapshot_is_to_scale(
 ) -> None:
     z, names = trajectory.z[row], trajectory.motions[trajectory.phase[row]].contacts
     scene, styles = heptagon.scene, choose_styles(trajectory.contacts)
-    _, *links, body = draw_snapshot(axes, scene, z, names, styles)[:4]
+    _, *links, body = draw_snapshot(axes, scene, z, names, styles, measure_box(scene, z[None]))[:4]
     corners = place_corners(scene, z)
     assert isinstance(body, Polygon)
     np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-13)

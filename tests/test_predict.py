@@ -128,7 +128,7 @@ def replay(speed: float) -> Simulation:
     a, b = speed**2 * 2 * (1 - 2 * x) / road.length, speed**2 * 4 * x * (1 - x)
     tau = road.forces.tau(a, b, road.force_limits.find_best(a, b).internal_force)
     t = road.length / (2 * speed) * np.arccos(1 - 2 * x)
-    return simulate(first_phase(), TorqueProfile.join_rows(t, tau))
+    return simulate(first_phase(), TorqueProfile.join_rows(np.column_stack([t, tau])))
 
 
 def test_the_replay_holds_below_the_predicted_speed_and_not_above() -> None:
@@ -316,7 +316,7 @@ def test_shipped_torques_hold_every_contact(path: Path, torques: str) -> None:
 def let_go() -> Report:
     """Finger 2 is lowered until it lets go."""
     t, tau = np.array([0.0, 0.1]), np.array([[0.6, 0.17], [0.6, 0.3]])
-    return verify(first_phase(), TorqueProfile.join_rows(t, tau))
+    return verify(first_phase(), TorqueProfile.join_rows(np.column_stack([t, tau])))
 
 
 def step(torque: TorqueProfile, time: float, by: Array) -> TorqueProfile:

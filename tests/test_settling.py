@@ -338,16 +338,15 @@ def test_breaks_just_before_the_end_of_a_phase_do_not_end_it_and_early_ends_keep
 
 def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
     rows = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.5]])
-    torque = TorqueProfile.join_rows(np.array([0.0, 0.02, 0.04, 0.04 + 1e-2]), rows)
+    torque = TorqueProfile.join_rows(np.column_stack([[0.0, 0.02, 0.04, 0.04 + 1e-2], rows]))
     assert describe_motors(heptagon, torque) == []
     slow = heptagon.with_(torque_rate_limit1=4.0, torque_rate_limit2=60.0)
     (t, text), *others = describe_motors(slow, torque)
     assert not others and t < 0.02 and "tau_1 changes at 5 N m/s" in text
     lagging = heptagon.with_(actuator_lag2=0.04)
     assert "takes a command of 2.5 N m" in describe_motors(lagging, torque)[0][1]
-    stepping = TorqueProfile.join_rows(
-        np.array([0.0, 0.02, 0.02, 0.05]), rows * [[1], [1], [5], [5]]
-    )
+    steps = np.column_stack([[0.0, 0.02, 0.02, 0.05], rows * [[1], [1], [5], [5]]])
+    stepping = TorqueProfile.join_rows(steps)
     assert "tau_1 steps by 0.4 N m at t = 0.02 s" in describe_motors(slow, stepping)[0][1]
     assert any("steps" in text for text in verify(slow, stepping).warnings)
 

@@ -210,8 +210,8 @@ def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
     phase = replace(phase, formation=make_formation(scene, "v0-palm v1-palm"))
     problem = replace(problem, scene=scene, start=away, phases=(phase,))
     D, J = swings.dry, swings.inertia
-    tau = np.column_stack([[0.0, 2 * D, -2 * D, -2 * D], np.full(4, 1e-3)])
-    torque = TorqueProfile.join_rows(np.array([0.0, 0.1, 0.3, 0.4]), tau)
+    rows = [[0.0, 0.1, 0.3, 0.4], [0.0, 2 * D, -2 * D, -2 * D], 4 * [1e-3]]
+    torque = TorqueProfile.join_rows(np.array(rows).T)
     simulation = simulate(problem, torque, tolerance=1e-12, times=[0.23, 0.24])
     # It starts at tau = D, is fastest when tau is D again, and is as slow when it has lost that.
     peak = 2 * 0.5 * D / J * 0.05
@@ -388,7 +388,8 @@ def draw(rng: np.random.Generator) -> tuple[Problem, TorqueProfile]:
     phase = Phase(0, Formation(scene, find_touching(scene, z)), Until(coordinate="x", value=-5.0))
     assert phase.formation.n_contacts == 3
     tau = 10 ** rng.uniform(-1.5, 0.2) * np.abs(rng.normal(size=(2, 6)))
-    torque = TorqueProfile.join_rows(np.linspace(0.0, 0.3, 6), (tau * [[1], [-1]]).T)
+    rows = np.column_stack([np.linspace(0.0, 0.3, 6), tau[0], -tau[1]])
+    torque = TorqueProfile.join_rows(rows)
     return Problem("random", scene, 0.0, z, (phase,)), torque
 
 

@@ -14,14 +14,7 @@ from scenes import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.results.dwell_record import assemble
-from wholearm.results.torque import (
-    ERROR,
-    TorqueProfile,
-    place_rows,
-    read_rows,
-    read_torque_csv,
-    sample_rows,
-)
+from wholearm.results.torque import ERROR, TorqueProfile, place_rows, read_torque_csv, sample_rows
 from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
 
 ARRAYS = ["t", "q", "theta", "q_dot", "theta_dot", "q_ddot", "theta_ddot", "tau", "c_n", "c_t"]
@@ -382,7 +375,7 @@ def test_rows_give_the_torques_back(error: float) -> None:
     torque = bent()
     rows = place_rows(torque, error)
     t = np.random.default_rng(1).uniform(0, 1, 4000)
-    missed = np.abs(read_rows(rows).at(t) - torque.at(t)).max()
+    missed = np.abs(TorqueProfile.join_rows(rows).at(t) - torque.at(t)).max()
     assert missed < 3 * error * np.abs(torque.at(t)).max()
     assert (np.diff(rows[:, 0]) >= 0).all() and np.isin(torque.breaks, rows[:, 0]).all()
     # One step, where the torques have it.
@@ -411,7 +404,7 @@ def test_what_lines_miss_has_no_mean_and_no_moment() -> None:
         return np.column_stack([np.exp(3 * t), t**4 + np.where(t < 0.4, 0.0, 0.7)])
 
     torque = TorqueProfile.fit(np.array([0.0, 0.1, 0.4, 1.0]), rising, 8)
-    table = read_rows(place_rows(torque, 1e-3))
+    table = TorqueProfile.join_rows(place_rows(torque, 1e-3))
     points, weights = np.polynomial.legendre.leggauss(8)
     breaks = np.union1d(torque.breaks, table.breaks)
     start, h = breaks[:-1, None], np.diff(breaks)[:, None]
@@ -444,7 +437,7 @@ def test_samples(rate: float) -> None:
     np.testing.assert_allclose(linear[:, 0], np.arange(count) / rate, atol=1e-13)
     np.testing.assert_allclose(linear[:, 1:], torque.at(linear[:, 0] + 1e-15), atol=1e-12)
     assert linear[-1, 0] >= torque.duration > linear[-2, 0]
-    staircase = read_rows(hold)
+    staircase = TorqueProfile.join_rows(hold)
     middle = linear[:-1, 0] + 0.5 / rate
     np.testing.assert_array_equal(staircase.at(middle), linear[:-1, 1:])
     assert len(hold) == 2 * (count - 1) and hold[-1, 0] == linear[-1, 0]

@@ -26,7 +26,7 @@ from wholearm.planning import replay_check
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.plan import solve
-from wholearm.results.torque import TorqueProfile, read_rows
+from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import Balance, balance
 from wholearm.verification.verdict import STRAY, Allowance, measure_stray
@@ -475,7 +475,7 @@ def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
 def test_a_table_holds_like_its_plan() -> None:
     problem, trajectory = plan()
     table = replay_check.make_table(problem, trajectory)
-    report = verify(problem, read_rows(table.rows))
+    report = verify(problem, TorqueProfile.join_rows(table.rows))
     assert report.ok and report.warnings == ()
     figures = table.figures
     assert figures["rows"] == len(table.rows) and figures["replay"]["ok"]

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..common.arrays import Array
+from ..common.arrays import Array, interpolate
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.fields import Field, Range
@@ -257,7 +257,7 @@ class Trial:
         near = near and angle <= self.uncertainty.angle
         given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
         even = np.linspace(0.0, t[-1], 24)
-        path = np.column_stack([np.interp(even, t, column) for column in simulation.z.T])
+        path = interpolate(even, t, simulation.z)
         return {
             "distance": distance,
             "angle": angle,

@@ -107,10 +107,10 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
         times.append(start + phase.torques.s / speed)
         rows.append(phase.torques.tau)
         start = float(times[-1][-1])
-    t, tau = np.concatenate(times), np.vstack(rows)
+    t = np.concatenate(times)
     # Where a direction reverses and where phases meet the torques step.
     kept = np.append(True, np.diff(t) > 0) | np.append(np.diff(t) > 0, True)
-    return TorqueProfile.join_rows(t[kept], tau[kept])
+    return TorqueProfile.join_rows(np.column_stack([t, np.vstack(rows)])[kept])
 
 
 def _predict_phase(

@@ -23,7 +23,7 @@ from ..contacts.contact_limits import takes_over
 from ..geometry.tracing import EndDistance
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
-from ..results.torque import TorqueProfile, format_rows, read_rows
+from ..results.torque import TorqueProfile, format_rows
 from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, FreeSimulation
 from ..simulation.simulate import simulate_free
@@ -219,7 +219,7 @@ class Tuning(Result):
     @property
     def torque(self) -> TorqueProfile | None:
         """The torques, None if there are none."""
-        return None if self.rows is None else read_rows(self.rows)
+        return None if self.rows is None else TorqueProfile.join_rows(self.rows)
 
     @property
     def ok(self) -> bool:
@@ -316,7 +316,7 @@ def tune(
                 clock += part.duration + SETTINGS.pause * problem.scene.scales.time
                 z = part.end
     rows = make_rows(steps, clock)
-    report = verify_free(problem, read_rows(rows))
+    report = verify_free(problem, TorqueProfile.join_rows(rows))
     return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
@@ -699,7 +699,7 @@ class PassageTuner:
     def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
-        torque = read_rows(make_rows(steps, end))
+        torque = TorqueProfile.join_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
         self.trials.append(self._judge(tuple(steps), simulation))
@@ -713,7 +713,9 @@ class PassageTuner:
         contact of the next phase, or else of the last one, has parted.
         """
         self.simulations += 1
-        simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
+        simulation = simulate_free(
+            self.problem, TorqueProfile.join_rows(make_rows(steps, end)), start=self.z
+        )
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
         parted = {
             name: max((b - a for a, b in simulation.list_pauses(name, arrival, end)), default=0.0)

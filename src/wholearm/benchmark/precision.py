@@ -607,12 +607,12 @@ def _read(solution: Any) -> Plan:
     """The torques linear between collocation points: their polynomials swing wide in between."""
     if solution.nlp_info.ipopt_status != 0:
         return str(solution.nlp_info.ipopt_status_message)
-    times, rows = [], []
+    rows = []
     for phase in solution.phase:
         tau = np.asarray(phase.control)[:2].T
-        times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
-        rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
-    return TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
+        t = [phase.initial_time, *np.ravel(phase.time_c), phase.final_time]
+        rows.append(np.column_stack([t, np.vstack([tau[:1], tau, tau[-1:]])]))
+    return TorqueProfile.join_rows(np.concatenate(rows))
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")

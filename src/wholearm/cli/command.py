@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     from ..benchmark.study import Study
     from ..common.document import Result
     from ..planning.replay_check import TorqueTable
-    from ..results.report import Report
-    from ..simulation.events import Simulation
-    from ..verification.free import FreeReport
 
 
 TOPICS = {
@@ -285,15 +282,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except WholearmError as error:
         _complain(str(error))
         return error.exit_status
-    except BrokenPipeError:
-        _silence_output()
-        return 1
     except OSError as error:
         # Files are written elsewhere, with errors of their own; this is the output.
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
-        _silence_output()
-        _complain(f"standard output: cannot be written: {error.strerror}")
+        # The interpreter would complain again, when it exits, about what cannot be written.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno != errno.EPIPE:
+            _complain(f"standard output: cannot be written: {error.strerror}")
         return 1
 
 
@@ -303,11 +299,6 @@ def _complain(text: str) -> None:
         print(f"wholearm: {text}", file=sys.stderr, flush=True)
     except OSError:
         pass  # nobody reads it
-
-
-def _silence_output() -> None:
-    """Keep the interpreter from complaining again, when it exits, about what cannot be written."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Parser(argparse.ArgumentParser):
@@ -326,8 +317,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
-        text = message.removeprefix("argument ")
-        raise InputError("", "", f"{text}; see {self.prog} --help")
+        raise InputError("", "", f"{message.removeprefix('argument ')}; see {self.prog} --help")
 
 
 def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
@@ -395,12 +385,8 @@ class _Lines:
 
     def begin(self, process: int) -> None:
         """Count from now on, for the work of a process."""
-        self._process, self._text = process, "working"
+        self._process, self.text = process, "working"
         self._begun = self._last = time.monotonic()
-
-    def say(self, text: str) -> None:
-        self._text = text
-        self.look()
 
     def look(self) -> None:
         """Print what was said last, if it is time."""
@@ -408,27 +394,25 @@ class _Lines:
         # A forked process has the same work, whose progress its parent tells.
         if now - self._last >= EVERY and os.getpid() == self._process:
             self._last = now
-            _complain(f"{now - self._begun:.0f} s: {self._text}")
+            _complain(f"{now - self._begun:.0f} s: {self.text}")
 
 
 _LINES = _Lines()  # those of the command, which may show progress of several things
 
 
-def show_progress() -> Callable[[str], None]:
-    """What shows progress: a line that changes in a terminal, and else one every ten seconds."""
-    if not sys.stderr.isatty():
-        return _LINES.say
-
-    def show(text: str) -> None:
+def show_progress(text: str) -> None:
+    """Show what is done: a line that changes in a terminal, and else one every ten seconds."""
+    if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
-
-    return show
+    else:
+        _LINES.text = text
+        _LINES.look()
 
 
 def clear_progress() -> None:
     """Remove the progress line."""
     if sys.stderr.isatty():
-        show_progress()("")
+        show_progress("")
 
 
 on_end(clear_progress)
@@ -475,11 +459,11 @@ def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def save_figure(path: str | None, function: str, result: Result) -> None:
-    """Draw a result by a function of the package, ``module:name``, if a file is given for it."""
+    """Draw a result by a function of `figures.result_figures`, if a file is given for it."""
     if path is not None:
-        module, name = function.split(":")
-        draw = getattr(import_module(f"wholearm.{module}"), name)
-        wholearm.plots.save(draw(result), path)
+        from ..figures import result_figures
+
+        wholearm.plots.save(getattr(result_figures, function)(result), path)
 
 
 def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
@@ -548,7 +532,7 @@ def _solve(options: argparse.Namespace) -> int:
             answer = find_route(options, problem)
             plan, route_text = answer.plan, answer.to_text()
         else:
-            plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
+            plan = solve_with(problem, plan_options, show_progress, options.time_limit)
         table = None if make_table is None else make_table(plan)
     except WholearmError as error:
         # Of bad input one line says everything.
@@ -597,6 +581,7 @@ def _verify(options: argparse.Namespace) -> int:
             raise InputError("", key, "does not go with --free")
     policy, notes = None, dict[str, list[str]]()
     torques: wholearm.Trajectory | wholearm.TorqueProfile
+    report: wholearm.Report | wholearm.FreeReport
     if not _is_table(options.torques):
         problem, torques, policy, notes = load_plan(options, options.torques, options.json)
     elif options.policy is not None:
@@ -609,11 +594,11 @@ def _verify(options: argparse.Namespace) -> int:
 
         check_phases(problem)
     if policy is not None and isinstance(torques, wholearm.Trajectory):
-        report: Report | FreeReport = wholearm.verify_policy(problem, torques, policy, **values)
+        report = wholearm.verify_policy(problem, torques, policy, **values)
     elif options.free:
-        report = wholearm.verify_free(problem, torques, progress=show_progress(), **values)
+        report = wholearm.verify_free(problem, torques, progress=show_progress, **values)
     else:
-        show_progress()(f"replaying {len(problem.phases)} phases")
+        show_progress(f"replaying {len(problem.phases)} phases")
         report = wholearm.verify(problem, torques, reduced=options.reduced, **values)
     if options.output is not None:
         report.trajectory.save(options.output)
@@ -636,7 +621,7 @@ def _plot(options: argparse.Namespace) -> int:
         if options.problem is None:
             raise InputError(options.trajectory, "--problem", "is needed to replay torques")
         problem = wholearm.load(options.problem)
-        trajectory = wholearm.simulate(problem, torques, progress=show_progress()).trajectory
+        trajectory = wholearm.simulate(problem, torques, progress=show_progress).trajectory
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
         figure = wholearm.plots.force_margins(
@@ -646,17 +631,17 @@ def _plot(options: argparse.Namespace) -> int:
     return finish(options, None, options.output)
 
 
-def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> Simulation | None:
+def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.Simulation | None:
     """Simulate the torques of a trajectory; `simulator` is told or free, or None for nothing."""
     if simulator is None:
         return None
     from ..problem.read import read_own_problem
 
-    problem, say = read_own_problem(trajectory.meta), show_progress()
+    problem = read_own_problem(trajectory.meta)
     if simulator == "free":
-        say("simulating the whole")
+        show_progress("simulating the whole")
         return wholearm.simulate_free(problem, trajectory).show(trajectory.contacts)
-    return wholearm.simulate(problem, trajectory.torque, progress=say)
+    return wholearm.simulate(problem, trajectory.torque, progress=show_progress)
 
 
 def _predict(options: argparse.Namespace) -> int:
@@ -666,8 +651,8 @@ def _predict(options: argparse.Namespace) -> int:
     require_output(options.torques, ".csv")
     require_with(options, "torques", "speed")
     problem = read_problem(options)
-    prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress())
-    save_figure(options.output, "figures.result_figures:draw_prediction", prediction)
+    prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress)
+    save_figure(options.output, "draw_prediction", prediction)
     status = finish(options, prediction)
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
@@ -678,7 +663,7 @@ def _predict(options: argparse.Namespace) -> int:
 def _tune(options: argparse.Namespace) -> int:
     require_output(options.output, ".csv")
     values = list_given(options, "brake", "stops", "squeeze", "share")
-    tuning = wholearm.tune(wholearm.load(options.problem), **values, progress=show_progress())
+    tuning = wholearm.tune(wholearm.load(options.problem), **values, progress=show_progress)
     output = options.output if tuning.ok else None
     if output is not None:
         write_text(output, tuning.to_csv())
@@ -688,8 +673,8 @@ def _tune(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     require_output(options.output)
     problem = wholearm.load(options.problem)
-    comparison = wholearm.compare(problem, options.files, show_progress())
-    save_figure(options.output, "figures.result_figures:draw_comparison", comparison)
+    comparison = wholearm.compare(problem, options.files, show_progress)
+    save_figure(options.output, "draw_comparison", comparison)
     return finish(options, comparison, options.output)
 
 
@@ -728,9 +713,9 @@ def _robustness(options: argparse.Namespace) -> int:
         path=output,
         fresh=options.fresh,
         start=choose_workers(options),
-        progress=show_progress(),
+        progress=show_progress,
     )
-    save_figure(options.figure, "figures.result_figures:draw_robustness", study)
+    save_figure(options.figure, "draw_robustness", study)
     return finish(options, study, output, options.figure, notes=notes)
 
 
@@ -762,7 +747,7 @@ def find_route(
             problem,
             **list_given(options, "cache", "time_limit", *keys_of(wholearm.PlanOptions)),
             alternatives=alternatives,
-            progress=show_progress(),
+            progress=show_progress,
             jobs=min(2, count_cores()) if options.jobs is None else options.jobs,
             hurry=hasten,
         )
@@ -783,13 +768,13 @@ def _save_map(
     from ..mapping.formation_map import choose_window
 
     window = choose_window(problem, phi)
-    chart = wholearm.build_map(problem, window=window, progress=show_progress(), **limit)
+    chart = wholearm.build_map(problem, window=window, progress=show_progress, **limit)
     wholearm.plots.save(wholearm.draw_map(chart, plan), output)
     clear_progress()
 
 
 def _map(options: argparse.Namespace) -> int:
-    poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
+    poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list]
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
     if phi and not 0 < phi[1] - phi[0] <= 360:
         raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
@@ -855,13 +840,11 @@ def _replay(options: argparse.Namespace) -> int:
     require_engine(options.engine)
     problem, plan, policy, notes = _load_replayed(options, options.json)
     _check_step(options, problem)
-    setting = Setting()
+    setting = Setting()._replace(**list_given(options, "softness"))
     if options.step is not None:
         setting = setting._replace(step=options.step / problem.scene.scales.time)
-    if options.softness is not None:
-        setting = setting._replace(softness=options.softness)
     arguments: dict[str, Any] = {"whole": options.whole, "setting": setting}
-    arguments["progress"] = show_progress()
+    arguments["progress"] = show_progress
     if policy is None:
         arguments |= {"allowed": options.departure, "halvings": options.refine}
         with name_source(options.problem):
@@ -885,9 +868,7 @@ def _policy(options: argparse.Namespace) -> int:
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    say = show_progress()
-
-    planner = partial(plan_anew, progress=say)
+    planner = partial(plan_anew, progress=show_progress)
     names = "reserve", "period", "delay", "torque_limit", "contact_speed", "departure"
     values = list_given(options, *names) | {"planner": planner}
 
@@ -903,7 +884,7 @@ def _policy(options: argparse.Namespace) -> int:
             (f"a plan with epsilon = {epsilon:g} N", firm, {}),
         ]
         for words, scene, changes in trials:
-            say(f"trying {words}")
+            show_progress(f"trying {words}")
             with suppress(WholearmError):
                 tried = plan if scene is problem else planner(scene)
                 if find_policy(scene, tried, **({"contact_speed": 1.0} | values | changes))[1].ok:
@@ -914,10 +895,10 @@ def _policy(options: argparse.Namespace) -> int:
         return f"{', '.join(texts)} would not do either"
 
     with name_source(options.plan):
-        say("making and simulating the policy")
+        show_progress("making and simulating the policy")
         made, report = find_policy(problem, plan, **values)
         if options.largest:
-            say("looking for the widest ranges")
+            show_progress("looking for the widest ranges")
             each = find_widest(problem, plan, options.delay)
             made.about["largest"] = {str(number): factor for number, factor in each.items()}
     failures = "; ".join(report.failures)
@@ -950,11 +931,8 @@ def _sweep(options: argparse.Namespace) -> int:
     from ..problem.read import read_problem
 
     vary = read_vary(options.vary, options.samples)
-    parts = [
-        Path(options.problems[0]).stem,
-        *(re.sub(r"\W+", "_", name).strip("_") for name in vary),
-    ]
-    output = options.output or f"{'_'.join(parts)}.csv"
+    names = (re.sub(r"\W+", "_", name).strip("_") for name in vary)
+    output = options.output or f"{'_'.join([Path(options.problems[0]).stem, *names])}.csv"
     require_output(output, ".csv")
     require_output(options.figure)
     if options.figure is not None:
@@ -970,10 +948,10 @@ def _sweep(options: argparse.Namespace) -> int:
         checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
         path=f"{os.path.splitext(output)[0]}.jsonl" if require_ending(output, ".csv") else None,
         start=choose_workers(options),
-        progress=show_progress(),
+        progress=show_progress,
     )
     write_text(output, result.to_csv())
-    save_figure(options.figure, "figures.result_figures:draw_sweep", result)
+    save_figure(options.figure, "draw_sweep", result)
     return finish(options, result, output, options.figure)
 
 
@@ -985,14 +963,9 @@ def _sensitivities(options: argparse.Namespace) -> int:
         problem, _, _, notes = load_plan(options, options.plan, options.json)
         plan_options = wholearm.load_plan(options.plan).options
     result = wholearm.find_sensitivities(
-        problem,
-        plan_options,
-        options.of or (),
-        options.jobs,
-        show_progress(),
-        not options.differences,
+        problem, plan_options, options.of, options.jobs, show_progress, not options.differences
     )
-    save_figure(options.output, "figures.result_figures:draw_sensitivities", result)
+    save_figure(options.output, "draw_sensitivities", result)
     return finish(options, result, options.output, notes=notes)
 
 
@@ -1008,11 +981,11 @@ def _design(options: argparse.Namespace) -> int:
         options.over,
         options.minimise,
         **list_given(options, *names, *keys_of(wholearm.PlanOptions)),
-        progress=show_progress(),
+        progress=show_progress,
     )
     for plan, path in zip(result.plans, outputs, strict=True):
         wholearm.save(plan.problem, path)
-    save_figure(options.figure, "figures.result_figures:draw_search", result)
+    save_figure(options.figure, "draw_search", result)
     return finish(options, result, *outputs, options.figure)
 
 
@@ -1020,7 +993,7 @@ def _gallery(options: argparse.Namespace) -> int:
     from ..viewer.report_page import write_gallery
 
     require_output(options.output, ".md")
-    write_gallery(options.files, options.output, show_progress())
+    write_gallery(options.files, options.output, show_progress)
     return finish(options, None, options.output)
 
 
@@ -1041,7 +1014,7 @@ def _animate(options: argparse.Namespace) -> int:
         else:
             from ..viewer.movie import write_movie
 
-            how: Any = {"speed": options.speed, "progress": show_progress()}
+            how: Any = {"speed": options.speed, "progress": show_progress}
             write_movie(options.output, problem, trajectory, ghost, **how)
     return finish(options, None, options.output)
 
@@ -1052,13 +1025,13 @@ def _report(options: argparse.Namespace) -> int:
     stem = Path(options.problem).stem
     output = options.output or f"{stem}.html"
     require_output(output, ".html")
-    problem, say = read_problem(options), show_progress()
+    problem = read_problem(options)
     with tempfile.TemporaryDirectory() as folder:
         paths = options.files or [os.path.join(folder, f"{stem}.npz")]
         if not options.files:
-            wholearm.solve(problem, progress=say).save(paths[0])
+            wholearm.solve(problem, progress=show_progress).save(paths[0])
         text = Path(options.problem).read_text(encoding="utf-8")
-        content = build_report(problem, paths, text, say, sensitivities=options.sensitivities)
+        content = build_report(problem, paths, text, show_progress, options.sensitivities)
     write_text(output, content)
     return finish(options, None, output)
 
@@ -1165,7 +1138,7 @@ def _list_studies(options: argparse.Namespace) -> int:
 def _run_study(study: Study, options: argparse.Namespace) -> int:
     from ..benchmark.study import run_study
 
-    text, findings, written = run_study(study, options, show_progress())
+    text, findings, written = run_study(study, options, show_progress)
     clear_progress()
     print(text, *(f"wrote {path}\n" for path in written), sep="", end="")
     return 1 if findings else 0

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]  # floating-point numbers
+Numbers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 Expression = Any  # what CasADi computes with: SX, MX, DM or Function, for which it has no types
 
 
@@ -43,7 +45,7 @@ class Independent:
         return independent
 
 
-def find_runs(flags: NDArray[np.bool_], least: int = 1) -> list[slice]:
+def find_runs(flags: Flags, least: int = 1) -> list[slice]:
     """Runs of True in flags, shape (n,), of `least` places or more."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]]))).tolist()
     pairs = zip(edges[::2], edges[1::2], strict=True)
@@ -69,6 +71,11 @@ def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:
     squares = 4 * k * (k + alpha) * (k + beta) * (k + total)
     squares = squares / ((2 * k + total) ** 2 * (2 * k + total + 1) * (2 * k + total - 1))
     return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(np.sqrt(squares), -1))
+
+
+def interpolate(x: Array | float, places: Array, rows: Array) -> Array:
+    """Rows of a table, shape (n, k), at places x between increasing ones, by straight lines."""
+    return np.stack([np.interp(x, places, column) for column in rows.T], axis=-1)
 
 
 def find_minima(values: Array) -> Array:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 import numpy as np
 
 
-def plain(value: Any) -> Any:
-    """`value` in plain containers for JSON, with None for NaN and infinity.
+def plain(value: Any, finite: bool = True) -> Any:
+    """`value` in plain containers for JSON, if `finite` with None for NaN and infinity.
 
     Of named tuples and dataclasses the properties that they name as `derived`, and all fields but
     those that a `repr` leaves out.
@@ -30,10 +30,10 @@ def plain(value: Any) -> Any:
     elif isinstance(value, Enum):
         value = value.value
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(item, finite) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [plain(item, finite) for item in value]
+    return None if finite and isinstance(value, float) and not math.isfinite(value) else value
 
 
 def restore(kind: Any, value: Any) -> Any:
@@ -105,13 +105,9 @@ class Table(NamedTuple):
         """Aligned columns under their names."""
         forms, lines = self.forms, [self.heads, *self.cells[: self.most]]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        aligned = [f"{'>' if f else '<'}{width}" for f, width in zip(forms, widths, strict=True)]
         text = [self.title] if self.title else []
-        for line in lines:
-            padded = (
-                cell.rjust(width) if form else cell.ljust(width)
-                for cell, width, form in zip(line, widths, forms, strict=True)
-            )
-            text.append("  ".join(padded).rstrip())
+        text += ["  ".join(map(format, line, aligned)).rstrip() for line in lines]
         rest = len(self.rows) - len(self.rows[: self.most])
         return "\n".join([*text, *([f"... and {rest} more, see --json"] if rest else [])])
 
@@ -210,12 +206,12 @@ class Brief:
 class Drawn(Brief):
     """A motion or a map, which is a picture in notebooks: SVG under its line."""
 
+    drawn_by = "plots", "force_margins"  # module and function of `figures`
+
     def _repr_html_(self) -> str:
-        name, function = "plots", "force_margins"
-        if hasattr(self, "crossings"):
-            name, function = "map_figure", "draw_map"
         # Figures stand on everything else, so that nothing loads them before it is drawn.
-        figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
+        module = import_module(f"wholearm.figures.{self.drawn_by[0]}")
+        figure = getattr(module, self.drawn_by[1])(self)
         return f"<p>{escape(repr(self))}</p>{write_svg(figure)}"
 
 
@@ -329,9 +325,6 @@ def _write(value: Any) -> str:
 
 def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
     """The first differences in words; `one` and `other` say where the values stand."""
-    shown, rest = (parts := list(found))[:3], parts[3:]
-    text = ", ".join(
-        f"{difference.key} ({difference.one} {one}, {difference.other} {other})"
-        for difference in shown
-    )
-    return text + (f", and {len(rest)} more" if rest else "")
+    texts = [f"{d.key} ({d.one} {one}, {d.other} {other})" for d in found]
+    more = [f"and {len(texts) - 3} more"] if texts[3:] else []
+    return ", ".join(texts[:3] + more)

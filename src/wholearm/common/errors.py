@@ -83,6 +83,7 @@ class WholearmError(Exception):
 
     exit_status = 1  # of the command line: 1 if the task cannot be done, 2 if the input is bad
     phases: Sequence[int] = ()  # numbers of those that have no plan together, where that is known
+    phase: int | None = None  # number of the phase that was simulated
 
 
 class InputError(WholearmError):
@@ -111,14 +112,14 @@ class InputError(WholearmError):
 
 
 @contextmanager
-def name_source(source: str) -> Iterator[None]:
-    """Give the source to an `InputError` from inside the block that does not know its own."""
+def name_source(source: str = "", prefix: str = "") -> Iterator[None]:
+    """Give source and prefix of the key to an `InputError` from inside that has no source."""
     try:
         yield
     except InputError as error:
-        if error.source or not source:
+        if error.source or not (source or prefix):
             raise
-        raise InputError(source, error.key, error.problem) from None
+        raise InputError(source, prefix + error.key, error.problem) from None
 
 
 @contextmanager
@@ -160,13 +161,7 @@ class SolverError(WholearmError):
     """The solver stopped without an answer although the problem was not shown infeasible."""
 
 
-class _PhaseError(WholearmError):
-    """An error that a simulation may end with."""
-
-    phase: int | None = None  # number of the phase that was simulated
-
-
-class JammingError(_PhaseError):
+class JammingError(WholearmError):
     """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
 
     changes: tuple[Change, ...] = ()  # of one coefficient of friction, with which a plan was found
@@ -176,7 +171,7 @@ class AmbiguityError(JammingError):
     """Friction lets other contact forces than the planned ones be possible, or nearly so."""
 
 
-class SimulationError(_PhaseError):
+class SimulationError(WholearmError):
     """The forward simulation cannot go on (step size underflow, inconsistent start)."""
 
 

@@ -14,17 +14,14 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, Flags, Numbers, find_runs
 from ..common.errors import InputError
 from ..scene.model import Finger, Scene
 from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap, measure_gaps
 from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 
-Numbers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed

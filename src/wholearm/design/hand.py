@@ -268,5 +268,4 @@ def design_hand(
         text = f"none of {len(hands)} hands has a plan; the reason of {count} is: {reason}"
         raise InfeasibleError(text)
     best = aim.set(min(feasible, key=lambda hand: hand.cost))
-    plans = tuple(solve(problem.with_(best), **chosen) for problem in listed)
-    return Design(aim, plans, hands)
+    return Design(aim, tuple(solve(each.with_(best), **chosen) for each in listed), hands)

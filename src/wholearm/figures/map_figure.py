@@ -19,9 +19,8 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, Flags, Numbers, find_runs, interpolate
 from ..common.sharing import exclusive
-from ..contacts.closing import Flags, Numbers
 from ..contacts.elemental import Contact
 from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
@@ -279,15 +278,10 @@ def _measure(points: Array) -> Array:
     return np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
 
 
-def _find_along(points: Array, s: Array, places: Array) -> Array:
-    """Points of a polyline at lengths along it, shape (n, 2); `s` are those of its points."""
-    return np.column_stack([np.interp(places, s, column) for column in points.T])
-
-
 def find_middle(points: Array, share: float = 0.5) -> Array:
     """The place half way along a polyline, or a share of it, shape (2,)."""
     s = _measure(points)
-    return np.asarray(_find_along(points, s, share * s[-1:])[0])
+    return interpolate(share * s[-1], s, points)
 
 
 def place_heads(points: Array, way: float) -> Array:
@@ -298,7 +292,7 @@ def place_heads(points: Array, way: float) -> Array:
     k = np.searchsorted(s, places)
     run = _head(way * (points[k] - points[k - 1]))
     frame = np.stack([run, np.column_stack([-run[:, 1], run[:, 0]])], axis=1)
-    return np.asarray(_find_along(points, s, places)[:, None] + _HEAD @ frame)
+    return np.asarray(interpolate(places, s, points)[:, None] + _HEAD @ frame)
 
 
 def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) -> Array:

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.scale import SymmetricalLogTransform
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
@@ -42,16 +43,12 @@ SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, 
 
 
 def draw_margins(
-    axes: Axes,
-    trajectory: Trajectory,
-    epsilon: float,
-    styles: style.Styles,
-    covered: Array | None = None,
+    axes: Axes, trajectory: Trajectory, epsilon: float, styles: style.Styles, more: ArrayLike = ()
 ) -> None:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
     Lines are labelled with the names of contacts and broken where forces step. The scale covers
-    further margins `covered` [N], of any shape, too.
+    `more` margins [N], of any shape, too.
     """
     steps, margins = trajectory.find_steps(), trajectory.c_n - epsilon
     t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
@@ -65,8 +62,7 @@ def draw_margins(
         values = np.insert(margins[:, index], np.repeat(steps, 2), ends)
         axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
-    every = margins.ravel() if covered is None else np.append(margins, covered)
-    scale_margins(axes, every, epsilon)
+    scale_margins(axes, np.append(margins, more), epsilon)
 
 
 def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
@@ -105,11 +101,8 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
 
 def _scale_ticks(axes: Axes, factor: float) -> None:
     """Have the values at the ticks written times a factor."""
-
-    def show(y: float, _: object) -> str:
-        return f"{factor * y:.6g}".replace("-", "\u2212")
-
-    axes.yaxis.set_major_formatter(FuncFormatter(show))
+    scaled = FuncFormatter(lambda y, _: f"{factor * y:.6g}".replace("-", "\u2212"))
+    axes.yaxis.set_major_formatter(scaled)
 
 
 def draw_cones(
@@ -189,8 +182,7 @@ def draw_simulation(margins: Axes, torques: Axes, simulation: Simulation, epsilo
     t = simulation.t
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
-    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
-    lines[0].set_label("simulated")
+    margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)[0].set_label("simulated")
     other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
     for index, look in enumerate((SIMULATED, SIMULATED | other)):
         label = f"simulated {index + 1}"
@@ -292,8 +284,8 @@ def force_margins(
             for place in [places[3 * motion], *places[-2:][:rolls], *places[2::-1][: 3 * motion]]
         )
         panels = [margins, torques, *others]
-        covered = None if simulation is None else simulation.c_n - epsilon
-        draw_margins(margins, trajectory, epsilon, styles, covered)
+        more: ArrayLike = () if simulation is None else simulation.c_n - epsilon
+        draw_margins(margins, trajectory, epsilon, styles, more)
         draw_torques(torques, trajectory.torque, scene.torque_limit)
         if simulation is not None:
             draw_simulation(margins, torques, simulation, epsilon)

@@ -198,11 +198,8 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
 
 def _draw_ends(axes: Axes, study: Robustness) -> None:
     records = [record for record in study.records if "distance" in record]
-    uncertainty = study.trial.uncertainty
-    goal = (
-        1e3 * uncertainty.find_distance(study.trial.problem.scene),
-        math.degrees(uncertainty.angle),
-    )
+    uncertainty, scene = study.trial.uncertainty, study.trial.problem.scene
+    goal = 1e3 * uncertainty.find_distance(scene), math.degrees(uncertainty.angle)
     deviations = [(1e3 * record["distance"], math.degrees(record["angle"])) for record in records]
     least = 1e-4  # [mm] and [deg]: lesser ones are drawn so
     places = np.maximum(np.array(deviations).reshape(-1, 2), least)

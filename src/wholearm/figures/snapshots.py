@@ -15,9 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.document import fixed
 from ..contacts.elemental import parse_contact
 from ..results.trajectory import Trajectory
@@ -30,17 +29,12 @@ CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that 
 
 
 def draw_snapshot(
-    axes: Axes,
-    scene: Scene,
-    z: Array,
-    contacts: Sequence[str],
-    styles: Styles,
-    box: Array | None = None,
+    axes: Axes, scene: Scene, z: Array, contacts: Sequence[str], styles: Styles, box: Array
 ) -> list[Artist]:
     """Draw palm, links, object with numbered vertices, and contacts, on axes in m without a frame.
 
-    They show `box`, lower left and upper right corner, shape (2, 2) [m], or everything at the
-    configuration `z`, (5,). Returns palm, link 1, link 2, object, and one marker per contact.
+    They show a configuration, z (5,), within `box`: lower left and upper right corner, (2, 2) [m].
+    Returns palm, link 1, link 2, object, and one marker per contact.
     """
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="datalim")
@@ -53,7 +47,6 @@ def draw_snapshot(
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
         artists += axes.plot(*locate(scene, name, z[None]).point.T, marker, ms=6.5, **look)
-    box = measure_box(scene, z[None]) if box is None else box
     axes.set(xlim=box[:, 0], ylim=box[:, 1])
     scale = measure_scale(axes)
     corners = [parse_contact(name, scene) for name in contacts]
@@ -156,7 +149,7 @@ def trace_link(finger: Finger, angle: float) -> Array:
     return np.asarray(centres + finger.radius * np.column_stack([np.cos(turns), np.sin(turns)]))
 
 
-def choose_snapshots(trajectory: Trajectory) -> NDArray[np.int64]:
+def choose_snapshots(trajectory: Trajectory) -> Numbers:
     """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
     starts = trajectory.phase_starts
     parts = np.ones(len(starts) - 1, dtype=int)

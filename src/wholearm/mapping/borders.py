@@ -17,20 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
-from ..common.arrays import Array
-from ..contacts.closing import (
-    ClosedFinger,
-    Flags,
-    Numbers,
-    close_fingers,
-    first_contact,
-    lower,
-    place_corners,
-)
+from ..common.arrays import Array, Flags, Numbers
+from ..contacts.closing import ClosedFinger, close_fingers, first_contact, lower, place_corners
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
@@ -92,7 +84,12 @@ class Piece:
 
 def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
     """Labels of n poses inside cells, shape (n, 6); `NOWHERE` where a finger cannot close."""
-    return label_closed(close_fingers(scene, x, phi), lower(scene, phi)[1])
+    return label_inside(scene, close_fingers(scene, x, phi))
+
+
+def label_inside(scene: Scene, closed: ClosedFinger) -> Numbers:
+    """Labels of closed poses inside cells, shape (n, 6)."""
+    return label_closed(closed, lower(scene, closed.z[:, 2])[1])
 
 
 def label_closed(closed: ClosedFinger, vertex: int | Numbers) -> Numbers:
@@ -109,16 +106,14 @@ def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
     for phi, edge in window.flush_angles(scene):
         yield palm_track(scene, edge, phi, np.linspace(*window.x, samples))
     height = window.phi[1] - window.phi[0]
+    count = scene.polygon.n_vertices
     for low, high, vertex in window.bands(scene):
         places = np.linspace(low, high, max(3, round(samples * (high - low) / height)))
-        for finger in (0, 1):
-            for index in range(scene.polygon.n_vertices):
-                yield flush_track(scene, finger, index, vertex, places)
-                for branch in (-1.0, 1.0):
-                    yield _circle_track(scene, finger, index, None, branch, vertex, places)
-                    if scene.fingers[finger].radius > 0:
-                        for edge in ((index - 1) % scene.polygon.n_vertices, index):
-                            yield _circle_track(scene, finger, index, edge, branch, vertex, places)
+        for finger, index in product((0, 1), range(count)):
+            yield flush_track(scene, finger, index, vertex, places)
+            edges = ((index - 1) % count, index) if scene.fingers[finger].radius > 0 else ()
+            for branch, edge in product((-1.0, 1.0), (None, *edges)):
+                yield _circle_track(scene, finger, index, edge, branch, vertex, places)
 
 
 def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
@@ -155,18 +150,12 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         corners[..., 0] += x
         axis = (1.0 if finger == 0 else -1.0) * np.column_stack([-m[:, 1], m[:, 0]])
         near_run, far_run = ((corners - base) * axis).sum(axis=2)
-        labels = label_closed(closed, vertex)
         within = (near_run > 0) & (near_run <= link.length)
         # The edge lies on the link up to its far vertex or up to the tip.
-        on_tip = first + count + edge
-        reaches = far_run <= link.length
-        second = np.where(reaches, first + far, on_tip)
-        pair = np.column_stack([np.full(len(x), first + near), second])
-        pair[reaches] = [first + edge, first + after]
-        within &= _is_closed(closed, finger, np.arctan2(axis[:, 1], axis[:, 0]), pair)
-        labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
-        labels[~within | (labels[:, 0] == NOWHERE)] = NOWHERE
-        return labels
+        ends = [first + edge, first + after], [first + near, first + count + edge]
+        pair = np.where((far_run <= link.length)[:, None], *ends)
+        angle = np.arctan2(axis[:, 1], axis[:, 0])
+        return _label_pair(closed, vertex, finger, angle, pair, within)
 
     return Track(pose, label, places, LONGEST * scene.scales.length, (finger, edge))
 
@@ -198,7 +187,6 @@ def _circle_track(
         return base[0] - place[:, 0] + branch * across, phi
 
     def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
-        labels = label_closed(closed, vertex)
         place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
         angle = np.arctan2(place[:, 1], place[:, 0])
         sign = 1.0 if finger == 0 else -1.0
@@ -210,26 +198,21 @@ def _circle_track(
             corner, *others = _corners_at(scene, phi, vertex, index, *neighbours)
             away = [((other - corner) * inwards).sum(axis=1) for other in others]
             supported = np.minimum(*away) > -3e-11 * scene.scales.length
-            pair = np.broadcast_to([side, arc], (len(x), 2))
+            pair = np.array([side, arc])
         else:
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
             # The tip touches beyond its centre, and with the side that moves when it closes.
             m = _outward(scene, edge, phi)
             supported = (m * axis).sum(axis=1) <= 0
             supported &= sign * (m[:, 1] * axis[:, 0] - m[:, 0] * axis[:, 1]) <= 0
-            pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
+            pair = np.array([arc, first + count + edge])
         if link.radius == 0:
             aside = 3e-8 * scene.scales.length
-            contacts = [
-                close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)
-            ]
-            pair = np.sort(np.column_stack(contacts), axis=1)
+            pairs = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
+            pair = np.sort(np.column_stack(pairs), axis=1)
             about = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
-        same = _is_closed(closed, finger, angle, pair)
-        labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
-        labels[~supported | ~same | (labels[:, 0] == NOWHERE)] = NOWHERE
-        return labels
+        return _label_pair(closed, vertex, finger, angle, pair, supported)
 
     return Track(pose, label, places, LONGEST * scene.scales.length)
 
@@ -249,13 +232,19 @@ def _outward(scene: Scene, edge: int, phi: Array) -> Array:
     return np.column_stack([np.cos(heading), np.sin(heading)])
 
 
-def _is_closed(closed: ClosedFinger, finger: int, angle: Array, pair: Numbers) -> Flags:
-    """Whether a closed finger is at `angle`, where it would touch a pair of contacts."""
+def _label_pair(
+    closed: ClosedFinger, vertex: int, finger: int, angle: Array, pair: Numbers, possible: Flags
+) -> Numbers:
+    """Labels where a closed finger is at `angle`, at which it touches a pair of contacts."""
     with np.errstate(invalid="ignore"):
         off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
         touches = (closed.touched[:, [finger]] == pair).any(axis=1)
         # At the ends of a link angles lose digits.
-        return np.asarray((off < 1e-11) | (touches & (off < 1e-7)))
+        possible = possible & ((off < 1e-11) | (touches & (off < 1e-7)))
+    labels = label_closed(closed, vertex)
+    labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
+    labels[~possible | (labels[:, 0] == NOWHERE)] = NOWHERE
+    return labels
 
 
 def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
@@ -298,8 +287,6 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     pieces, first = [], 0
     for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
         rows, first = slice(first, first + size), first + size
-        if (labels[rows] == NOWHERE).all():
-            continue
         start, held = float(places[rows][0]), labels[rows][0]
         parts = []
         for before, after, following in changes.get(index, ()):

@@ -12,17 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
-from ..contacts.closing import (
-    ClosedFinger,
-    Numbers,
-    close_fingers,
-    contact_table,
-    describe_obstacle,
-    lower,
-)
+from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
@@ -32,17 +25,8 @@ from ..mechanics.dynamics import metric_weights
 from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
-from ..scene.model import TURN, Polygon, Scene, check_place
-from .borders import (
-    Track,
-    Window,
-    cut,
-    flush_track,
-    label_cells,
-    label_closed,
-    name_contacts,
-    palm_track,
-)
+from ..scene.model import PLACE, TURN, Polygon, Scene
+from .borders import Track, Window, cut, flush_track, label_inside, name_contacts, palm_track
 
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
 _COMMENTS = 31  # Column of the comments
@@ -94,7 +78,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
     corners = [np.array(pose, dtype=float) for pose in poses]
     for x, phi in corners:
-        check_place(problem.scene, "route", float(x))
+        PLACE.check("route", float(x), "m", problem.scene)
         TURN.check("route", math.degrees(phi), "degrees")
     near = tolerance(problem.scene)
     for one, two in pairwise(corners):
@@ -102,20 +86,20 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             text = f"two poses at {describe_pose(one)} are the same place"
             raise InputError("", "route", text)
     z, start, corners, notes = _begin(problem, corners)
-    here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
-    origin = here
-    for leg, there in enumerate(corners):
+    origin, stretches = z[[0, 2]], list[Stretch]()
+    for leg, there in enumerate(corners, start=1):
+        here = z[[0, 2]]
         note = describe_miss(problem.scene, here, there)
         try:
             walked = walk_leg(problem, len(stretches), z, here, there)
         except InputError as error:
-            text = f"leg {leg + 1} {error.problem}" + (f"; {note}" if note else "")
+            text = f"leg {leg} {error.problem}" + (f"; {note}" if note else "")
             raise InputError("", "route", text) from None
         if note:
-            notes.append(f"leg {leg + 1} goes through cells: {note}")
-        for (contacts, until), end in walked:
+            notes.append(f"leg {leg} goes through cells: {note}")
+        for k, ((contacts, until), end) in enumerate(walked):
             stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
-            before = stretches[-1] if stretches and legs[-1] != leg else None
+            before = stretches[-1] if stretches and k == 0 else None
             # On a border a leg may continue the one before; a reversal is a new phase.
             if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
                 runs = (before.stop - before.start) * (stretch.stop - stretch.start)
@@ -124,9 +108,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
                     stretches.pop()
                     stretch = replace(stretch, contacts=before.contacts, start=before.start)
             stretches.append(stretch)
-            legs.append(leg)
             z = end
-        here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
     stretches[0] = replace(stretches[0], start=origin)
     route = Route(stretches)
@@ -245,8 +227,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
         try:
             for contacts, until in steps:
                 start = end
-                phase = Phase(index + len(walked), Formation(scene, contacts), until)
-                end = find_end(phase, start)
+                end = find_end(Phase(index + len(walked), Formation(scene, contacts), until), start)
                 moved = metric_weights(scene) @ (end - start) ** 2
                 if moved < (STILL * scene.scales.length) ** 2:
                     text = f"{until} holds already at {describe_pose(start)}"
@@ -400,7 +381,7 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
             # Each place has to be within `NEAR` of where the contact touches.
             x, phi = leg.track.pose(np.linspace(first, last, 9))
             poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
-            near = label_cells(scene, *poses.T).reshape(9, len(box), -1)[..., column]
+            near = label_inside(scene, close_fingers(scene, *poses.T))[:, column].reshape(9, -1)
             if (near == contacts[k - 1]).any(axis=1).all():
                 contacts[k : k + int(again[0])] = contacts[k - 1]
     kept: list[Span] = []
@@ -452,12 +433,10 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
         points = start + s[:, None] * (stop - start)
         return points[:, 0], points[:, 1]
 
-    def label(_: Array, phi: Array, closed: ClosedFinger) -> Numbers:
-        return label_closed(closed, lower(scene, phi)[1])
-
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    return Leg(Track(pose, label, places, np.inf), 0.0, 1.0, share)
+    track = Track(pose, lambda x, phi, closed: label_inside(scene, closed), places, np.inf)
+    return Leg(track, 0.0, 1.0, share)
 
 
 def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:
@@ -495,13 +474,10 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
         return np.asarray(np.nan_to_num((np.abs(points - pose) / near).max(axis=1), nan=np.inf))
 
     low, high = float(track.places[0]), float(track.places[-1])
-    phi = float(np.clip(pose[1], low, high))
-    straight = float(off(np.array([phi]))[0])
-    if straight < 1:
-        return phi, straight
-    places = np.linspace(low, high, PLACES)
+    places = np.append(np.clip(pose[1], low, high), np.linspace(low, high, PLACES))
     away = off(places)
-    k = int(away.argmin())
+    # That of the same phi, if it is near.
+    k = 0 if away[0] < 1 else 1 + int(away[1:].argmin())
     return float(places[k]), float(away[k])
 
 

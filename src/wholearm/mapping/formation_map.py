@@ -13,20 +13,11 @@ from itertools import product
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Flags, Numbers, interpolate
 from ..common.document import Drawn
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..contacts.closing import (
-    Flags,
-    Numbers,
-    close_fingers,
-    contact_table,
-    evaluate_each,
-    find_reach,
-    group_alike,
-    lower,
-)
+from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_alike
 from ..contacts.elemental import Contact
 from ..contacts.formation import Kinematics
 from ..geometry.curve import solve_tangent
@@ -37,18 +28,9 @@ from ..mechanics.path_limits import InternalForceLimits, PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..planning.lower_bound import GIVE
-from ..problem.definition import Problem
+from ..problem.definition import ROWS, Problem
 from ..scene.model import Scene
-from .borders import (
-    NOWHERE,
-    Piece,
-    Window,
-    cut,
-    label_cells,
-    label_closed,
-    list_tracks,
-    name_contacts,
-)
+from .borders import NOWHERE, Piece, Window, cut, label_inside, list_tracks, name_contacts
 from .formation_list import trace_problem
 
 WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # travel inside a cell: x, phi
@@ -88,6 +70,8 @@ class Crossing:
 @dataclass(frozen=True, eq=False, repr=False)
 class FormationMap(Drawn):
     """The cells, borders and crossings of a window of the (x, phi) plane."""
+
+    drawn_by = "map_figure", "draw_map"
 
     problem: Problem
     x: Array  # x, phi (n_x,) and (n_phi,) [m] and [rad]: grid
@@ -145,7 +129,6 @@ def build_map(
         raise InputError(problem.source, "", "the fingers reach the object nowhere in the window")
     cells = -obstacle
     cells[obstacle == 0] = cell.ravel()
-    table = contact_table(scene)
     report("map: borders")
     samples = round(100 * max(1.0, window.phi[1] - window.phi[0]))
     tracks = list(list_tracks(scene, window, samples))
@@ -155,21 +138,14 @@ def build_map(
     ends = np.linspace(*window.x, 25), np.linspace(*window.phi, 25)
     middles = np.meshgrid(*((values[1:] + values[:-1]) / 2 for values in ends))
     places = np.column_stack([part.ravel() for part in middles])
-    inside = label_cells(scene, *places.T)
-    places, inside = places[inside[:, 0] != NOWHERE], inside[inside[:, 0] != NOWHERE]
-    z = close_fingers(scene, *places.T).z
+    closed = close_fingers(scene, *places.T)
+    inside = label_inside(scene, closed)
+    free = inside[:, 0] != NOWHERE
+    places, inside, z = places[free], inside[free], closed.z[free]
     directions = _check_cells(problem, inside[:, [0, 2, 4]], z, limit)
-    return FormationMap(
-        problem,
-        x,
-        phi,
-        cells,
-        tuple(name_contacts(table, row) for row in rows),
-        tuple(borders),
-        _find_crossings(scene, borders),
-        places,
-        *directions,
-    )
+    formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
+    parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
+    return FormationMap(problem, x, phi, *parts, places, *directions)
 
 
 def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> list[Border]:
@@ -177,20 +153,19 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     if not pieces:
         return []
     scene = problem.scene
-    x, phi = (
-        np.concatenate(part) for part in zip(*(p.track.pose(p.places) for p in pieces), strict=True)
-    )
-    z = close_fingers(scene, x, phi).z
-    labels = np.concatenate([np.tile(piece.label, (len(piece.places), 1)) for piece in pieces])
+    points = np.concatenate([np.column_stack(p.track.pose(p.places)) for p in pieces])
+    z = close_fingers(scene, *points.T).z
     owner = np.repeat(np.arange(len(pieces)), [len(piece.places) for piece in pieces])
     # At an end, rounding may keep a finger from closing.
     closed = np.isfinite(z).all(axis=1)
-    x, phi, z = x[closed], phi[closed], z[closed]
-    labels, owner = labels[closed], owner[closed]
+    points, z, owner = points[closed], z[closed], owner[closed]
+    labels = np.array([piece.label for piece in pieces])[owner]
     flush = np.array([piece.track.flush is not None for piece in pieces])[owner]
+    on_palm = [piece.track.flush is not None and piece.track.flush[0] is None for piece in pieces]
+    along = ["x" if palm else "phi" for palm in on_palm]
     flags = np.zeros((3, len(z)), dtype=bool)
     if flush.any():
-        rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
+        rows = np.array([ROWS[name] for name in along])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
         kinematics = evaluate_each(scene, chosen, z[flush])
         weights = np.sqrt(metric_weights(scene))
@@ -206,16 +181,9 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     for index, piece in enumerate(pieces):
         mine = owner == index
         contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
-        points = np.column_stack([x[mine], phi[mine]])
-        along, flags_here = _along(piece), flags[:, mine]
-        borders.append(Border(contacts, piece.track.flush, along, points, z[mine], *flags_here))
+        curve = along[index], points[mine], z[mine]
+        borders.append(Border(contacts, piece.track.flush, *curve, *flags[:, mine]))
     return borders
-
-
-def _along(piece: Piece) -> str:
-    """The coordinate that increases along a piece."""
-    flush = piece.track.flush
-    return "x" if flush is not None and flush[0] is None else "phi"
 
 
 def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:
@@ -319,9 +287,7 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
     """Range of phi [rad] to a little beyond the flush angles around the phases."""
     angles = [float(problem.start[2])]
     angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
-    for phase in problem.phases:
-        if phase.until.coordinate == "phi" and phase.until.value is not None:
-            angles.append(phase.until.value)
+    angles += [v for phase in problem.phases for row, v in phase.until.poses if row == ROWS["phi"]]
     angles += [goal.find_angle(problem.scene, angles[-1]) for goal in problem.goals]
     low, high = min(angles), max(angles)
     around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
@@ -335,14 +301,11 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
 
 def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
     """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
-    x, phi = (part.ravel() for part in np.meshgrid(x, phi))
-    closed = close_fingers(scene, x, phi)
-    labels = label_closed(closed, lower(scene, phi)[1])
-    both = closed.obstacle
-    codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
+    shape, places = (len(phi), len(x)), [part.ravel() for part in np.meshgrid(x, phi)]
+    closed = close_fingers(scene, *places)
+    codes = np.where(closed.obstacle > 0, 2 * closed.obstacle - 1 + np.array([0, 1]), 0)
     obstacle = np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1])
-    shape = (len(np.unique(phi)), -1)
-    return labels.reshape(*shape, 6), obstacle.reshape(shape)
+    return label_inside(scene, closed).reshape(*shape, 6), obstacle.reshape(shape)
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
@@ -362,7 +325,7 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
         chords = np.diff(border.z, axis=0)
         arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
         s = places * arcs[-1]
-        z = np.column_stack([np.interp(s, arcs, column) for column in border.z.T])
+        z = interpolate(s, arcs, border.z)
         every.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
     z, chord, length = (np.concatenate(column) for column in zip(*every, strict=True))
     indices = [[table.index(contact) for contact in border.contacts] for border in borders]

@@ -94,7 +94,7 @@ class Planning:
     @cached_property
     def settled(self) -> Plans:
         """The plans with dwells at their ends, where the problem asks for these."""
-        if not self.problem.is_settled:
+        if all(self.problem.settles(phase) == 0 for phase in self.problem.phases):
             return self.plans
         from .dwell import settle_plans
 

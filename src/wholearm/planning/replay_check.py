@@ -19,7 +19,7 @@ from ..problem.definition import Problem
 from ..results.dwell_record import assemble
 from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
-from ..results.torque import ERROR, format_rows, place_rows, read_rows, sample_rows
+from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
@@ -245,14 +245,14 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
     least, error = ERROR / _FINER ** (_ATTEMPTS - 1), ERROR
     rows = place_rows(trajectory.torque, error, rate_limit)
     # Commands step where the slopes of lines do, so that motors' limits need no replay.
-    while error > least and describe_motors(problem, read_rows(rows)):
+    while error > least and describe_motors(problem, TorqueProfile.join_rows(rows)):
         error /= 2
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
         return _tabulate(problem, trajectory, rows, None)
     for _ in range(_ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
-        simulation = observe(problem, read_rows(rows), trajectory)
+        simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
         report = judge(simulation, trajectory, Allowance())
         if report.ok or error <= least:
             break
@@ -276,7 +276,7 @@ def sample_table(
     compared: dict[str, Any] | None = None
     if replay:
         try:
-            simulation = observe(problem, read_rows(rows), trajectory)
+            simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
             compared = _compare(trajectory, judge(simulation, None, Allowance()))
         except (JammingError, SimulationError) as error:
             compared = {"ok": False, "reason": str(error), "phases": []}

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from numpy.typing import ArrayLike
 
 from ..common.document import Document, Drawn, Result, Table, fixed, plain, restore
-from ..common.errors import InputError
+from ..common.errors import InputError, name_source
 from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import read_own_problem
 from ..results.dwell_record import Settling
@@ -220,12 +220,11 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     source = str(path)
     problem = read_own_problem(trajectory.meta, source)
     try:
-        return _read(trajectory, problem)
+        with name_source(source, "meta."):
+            return _read(trajectory, problem)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"does not describe a plan: {type(error).__name__} {error}"
         raise InputError(source, "meta", what) from None
-    except InputError as error:
-        raise InputError(source, f"meta.{error.key}", error.problem) from None
 
 
 def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -311,11 +312,6 @@ class Problem:
         return phase.settle
 
     @property
-    def is_settled(self) -> bool:
-        """Whether any end that comes to rest is held."""
-        return any(self.settles(phase) != 0 for phase in self.phases)
-
-    @property
     def gap(self) -> float:
         """By how much a contact may be open that closes at such an end [m]."""
         default = 3e-3 * self.scene.scales.length  # 0.1 mm of 35 mm
@@ -394,23 +390,19 @@ def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
     Those of torques and of the start do nothing here.
     """
-
-    def change(name: str) -> float:
-        return changes.get(name, 0.0)
-
-    body = scene.polygon
+    changes, body = defaultdict(float, changes), scene.polygon
     assert body.inertia is not None
-    mass, inertia = body.mass * (1 + change("mass")), body.inertia * (1 + change("inertia"))
+    mass, inertia = body.mass * (1 + changes["mass"]), body.inertia * (1 + changes["inertia"])
     first, second = (
         replace(
             finger,
-            length=finger.length + change(f"length{number}"),
-            base=np.asarray(finger.base) + [change(f"base{number}_{axis}") for axis in "xy"],
+            length=finger.length + changes[f"length{number}"],
+            base=np.asarray(finger.base) + [changes[f"base{number}_{axis}"] for axis in "xy"],
         )
         for number, finger in enumerate(scene.fingers, start=1)
     )
     parts = ("palm", "finger1", "finger2")
-    mu = {part: getattr(scene.friction, part) * (1 + change(f"friction_{part}")) for part in parts}
+    mu = {part: getattr(scene.friction, part) * (1 + changes[f"friction_{part}"]) for part in parts}
     return replace(
         scene,
         polygon=replace(body, mass=mass, inertia=inertia),

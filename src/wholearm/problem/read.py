@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product, zip_longest
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,11 @@ from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation, describe, find_touching
 from ..scene.model import FRICTION as COEFFICIENTS
-from ..scene.model import PLACE, TURN, Finger, Friction, Polygon, Scene, check_place, check_ranges
+from ..scene.model import PLACE, TURN, Finger, Friction, Polygon, Scene, check_ranges
 from .definition import (
     CONTACT,
     GROUPS,
     INDEX,
-    LENGTH,
     PARAMETERS,
     ROWS,
     End,
@@ -51,18 +50,16 @@ from .definition import (
     Phase,
     Problem,
     Until,
+    read_widths,
     spread_widths,
 )
 
-_T = TypeVar("_T")
 Table = Mapping[str, Field]
 """Keys of a table by name."""
 
 
-_WIDTHS = {
-    field.name: replace(field, default=field.default * (LENGTH if field.unit == "m" else 1))
-    for field in PARAMETERS
-}
+_DEFAULTS = read_widths({})
+_WIDTHS = {field.name: replace(field, default=_DEFAULTS[field.name]) for field in PARAMETERS}
 OBJECT, FINGER, FRICTION, PHASE, GOAL = (
     name_fields(*keys_of(field).values()) for field in (Polygon, Finger, Friction, Phase, Goal)
 )
@@ -104,6 +101,10 @@ _PARTS = name_fields(
     declare("phases", kind=leave({"type": "array", "items": refer("phase")}), default=None),
 )
 TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
+_TABLES = {
+    "object": OBJECT, "finger": FINGER, "friction": FRICTION, "start": START,
+    "uncertainty": UNCERTAINTY, "goal": GOAL,
+}  # fmt: skip
 
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
@@ -134,7 +135,7 @@ def read_problem(path: str) -> Problem:
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """The problem of a file's nested tables, or an `InputError` that names `source`."""
     with name_source(source):
-        check_keys(table, "", TOP)
+        _table(table, "", TOP)
         polygon = Polygon(**collect_keys(Polygon, _table(table["object"], "object", OBJECT)))
         fingers = _table(table["fingers"], "fingers", FINGERS)
         coefficients = _table(table["friction"], "friction", FRICTION)
@@ -174,10 +175,8 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
     if not isinstance(table, Mapping) or not table:
         text = "the trajectory does not hold its problem's tables"
         raise InputError(source, "meta.problem", text)
-    try:
+    with name_source(source, "meta.problem."):
         return build_problem(table)
-    except InputError as error:
-        raise InputError(source, f"meta.problem.{error.key}", error.problem) from None
 
 
 def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
@@ -208,7 +207,7 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
 
     InputError if `x` [m], of the centroid, is out of its range, or a finger does not reach.
     """
-    check_place(scene, "start.x", x)
+    PLACE.check("start.x", x, "m", scene)
     q = place_flush(scene, flush, x)
     try:
         z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
@@ -226,11 +225,11 @@ def read_phase(scene: Scene, index: int, given: object) -> Phase:
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
-    formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
+    with name_source(prefix=f"{key}.contacts"):
+        formation = read_formation(scene, names)
     end = End(PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
-    until = Until()
-    if "until" in entry:
-        until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
+    with name_source(prefix=f"{key}.until"):
+        until = read_until(scene, entry["until"]) if "until" in entry else Until()
     guess = _read_guess(formation, entry["guess"], f"{key}.guess") if "guess" in entry else None
     return Phase(index, formation, until, end, entry.get("settle"), guess)
 
@@ -250,7 +249,7 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         )
         if t <= (modes[-1].t if modes else 0.0):
             raise InputError("", f"{name}.t", f"{t:g} given; allowed is more than before")
-        check_place(scene, f"{name}.x", x)
+        PLACE.check(f"{name}.x", x, "m", scene)
         TURN.check(f"{name}.phi_deg", phi, "degrees")
         signs = entry["signs"]
         if not isinstance(signs, str) or not re.fullmatch(rf"[-+0]{{{count}}} [-+]{{2}}", signs):
@@ -309,32 +308,19 @@ def read_until(scene: Scene, given: object) -> Until:
     return Until(None, coordinate, value, tuple(others))
 
 
-def _at(key: str, read: Callable[[], _T]) -> _T:
-    """Run `read`, giving the key to an error that does not know its own."""
-    try:
-        return read()
-    except InputError as error:
-        raise InputError("", key, error.problem) from None
-
-
 def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
     if not isinstance(value, Mapping):
         raise InputError("", key, f"{value!r} is not a table")
-    check_keys(value, key, known)
-    return value
-
-
-def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
-    """Check that a table has what is required, and nothing unknown."""
-    prefix = f"{where}." if where else ""
-    for key in table:
-        if key not in known:
+    prefix = f"{key}." if key else ""
+    for name in value:
+        if name not in known:
             allowed = f"allowed are {', '.join(sorted(known))}"
-            raise InputError("", f"{prefix}{key}", f"unknown key; {suggest(key, known)}{allowed}")
-    for key in sorted(name for name, field in known.items() if field.required):
-        if key not in table:
-            raise InputError("", f"{prefix}{key}", "is missing")
+            raise InputError("", f"{prefix}{name}", f"unknown key; {suggest(name, known)}{allowed}")
+    for name in sorted(name for name, field in known.items() if field.required):
+        if name not in value:
+            raise InputError("", f"{prefix}{name}", "is missing")
+    return value
 
 
 @exclusive
@@ -345,7 +331,7 @@ def check_problem(problem: Problem) -> None:
         value = field.read(getattr(problem, attribute), field.name)
         field.check(value, field.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
-    check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
+    PLACE.check("start.x", float(require_vector(problem.start, "start", 5)[0]), "m", problem.scene)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
@@ -377,7 +363,7 @@ def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
     else:
         _check_edge(scene, goal.flush, f"{key}.flush")
     if goal.x is not None:
-        check_place(scene, f"{key}.x", goal.x)
+        PLACE.check(f"{key}.x", goal.x, "m", scene)
 
 
 def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
@@ -389,7 +375,7 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
         if not isinstance(entry, Mapping):
             text = f"{entry!r} given; allowed is a table with flush or phi_deg, and x"
             raise InputError("", key, text)
-        check_keys(entry, key, GOAL)
+        _table(entry, key, GOAL)
         values = {name: GOAL[name].read(entry[name], f"{key}.{name}") for name in entry}
         if "phi_deg" in values:
             values["phi"] = math.radians(values.pop("phi_deg"))
@@ -447,7 +433,7 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
             raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
         value = require_number(target, key)
         if coordinate == "x":
-            check_place(scene, key, value)
+            PLACE.check(key, value, "m", scene)
         else:
             # Rounding in radians is no matter at the end of the range.
             TURN.check(key, round(math.degrees(value), 9), "degrees")
@@ -533,11 +519,8 @@ def name_keys() -> dict[str, tuple[str, ...]]:
 
 def build_schema() -> dict[str, Any]:
     """The JSON Schema of problem files."""
-    tables = {
-        "object": OBJECT, "fingers": FINGERS, "finger": FINGER, "friction": FRICTION,
-        "start": START, "uncertainty": UNCERTAINTY, "goal": GOAL, "phase": PHASE, "until": UNTIL,
-        "mode": MODE,
-    }  # fmt: skip
+    tables = {"object": OBJECT, "fingers": FINGERS} | _TABLES
+    tables |= {"phase": PHASE, "until": UNTIL, "mode": MODE}
     definitions = {name: _describe(table) for name, table in tables.items()}
     smooth = {"required": ["end"], "properties": {"end": {"const": "smooth"}}}
     definitions["phase"]["anyOf"] = [{"required": ["until"]}, smooth]
@@ -569,18 +552,10 @@ def _describe(table: Table) -> dict[str, Any]:
 
 def write_page() -> str:
     """All keys of a problem file, as tables in Markdown."""
-    tables = {
-        "At the top": TOP,
-        "`[object]`": OBJECT,
-        "`[fingers.1]`, `[fingers.2]`": FINGER,
-        "`[friction]`": FRICTION,
-        "`[start]`": START,
-        "`[uncertainty]`": UNCERTAINTY,
-        "`[goal]`": GOAL,
-        "`[[phases]]`": PHASE,
-    }
+    titles = {name: f"`[{name}]`" for name in _TABLES} | {"finger": "`[fingers.1]`, `[fingers.2]`"}
+    tables = [("At the top", TOP), *((titles[name], table) for name, table in _TABLES.items())]
     parts = []
-    for title, table in tables.items():
+    for title, table in [*tables, ("`[[phases]]`", PHASE)]:
         lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
         for name, field in table.items():
             if name not in _PARTS:

@@ -8,10 +8,12 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.document import plain
 from ..common.errors import InputError, suggest
 from ..common.fields import Field, keys_of
 from ..common.files import require_ending, write_text
@@ -43,7 +45,7 @@ def change_table(
             raise InputError("", name, f"unknown name; {suggest(name, names)}{allowed}")
         whole = name == "friction" and isinstance(value, Mapping)
         for key in (name,) if dotted or whole else names[name]:
-            _set(changed, key, _to_plain(value))
+            _set(changed, key, plain(value, finite=False))
     return changed
 
 
@@ -77,15 +79,6 @@ def _enter(place: Any, step: str | int, key: str) -> Any:
     return place[step]
 
 
-def _to_plain(value: Any) -> Any:
-    """Numbers, text, lists and tables as a file has them."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _to_plain(item) for key, item in value.items()}
-    return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
 def write_table(problem: Problem) -> Mapping[str, Any]:
     """The nested tables of a problem file, without defaults.
 
@@ -102,7 +95,7 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     }
     table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}, "start": start}
     if problem.uncertainty is not None:
-        table["uncertainty"] = _to_plain(problem.uncertainty)
+        table["uncertainty"] = plain(problem.uncertainty)
     goals = [
         {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
         for goal in problem.goals
@@ -140,32 +133,29 @@ def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]
     """Dotted keys, values and declarations of parts of a problem."""
     for prefix, part in parts:
         for attribute, field in keys_of(part).items():
-            value = _to_plain(getattr(part, attribute))
+            value = plain(getattr(part, attribute))
             if attribute == "inertia" and isinstance(part, Polygon):
                 value = None if value == part.uniform_inertia else value
-            yield f"{prefix}{field.name}", None if value == math.inf else value, field
+            yield f"{prefix}{field.name}", value, field
 
 
 def _find_start(problem: Problem) -> dict[str, Any] | None:
     """The table of the start, or None if no edge is flush there or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
     units = np.array([scene.scales.length, scene.scales.length, 1.0])
-    try:
-        closed = [close_finger(scene, q, finger) for finger in (0, 1)]
-    except InputError:
-        return None
-    if np.abs(problem.start[3:] - closed).max() > 1e-9:
-        return None
     for edge in range(scene.polygon.n_vertices):
-        flush = place_flush(scene, edge, float(q[0]))
-        if (np.abs(flush - q) <= 1e-12 * units).all():
-            return {"flush": edge, "x": float(q[0])}
+        if (np.abs(place_flush(scene, edge, float(q[0])) - q) <= 1e-12 * units).all():
+            with suppress(InputError):
+                closed = [close_finger(scene, q, finger) for finger in (0, 1)]
+                if np.abs(problem.start[3:] - closed).max() <= 1e-9:
+                    return {"flush": edge, "x": float(q[0])}
     return None
 
 
 def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
     """A phase as an entry of a file, with angles of at most so many decimals."""
-    entry: dict[str, Any] = {"contacts": name_contacts(phase)}
+    contacts, rolling = phase.formation.contacts, phase.formation.rolling
+    entry: dict[str, Any] = {"contacts": [c.name + " rolling" * (c in rolling) for c in contacts]}
     if not phase.until.is_release:
         entry["until"] = write_until(phase.until, digits)
     if phase.settle is not None:
@@ -192,12 +182,6 @@ def write_until(until: Until, digits: int = 15) -> Any:
 def format_until(until: Until) -> str:
     """The value of `until` in a problem file, to read."""
     return _write(write_until(until, SAME))
-
-
-def name_contacts(phase: Phase) -> list[str]:
-    """Contacts of a phase as its file names them."""
-    rolling = phase.formation.rolling
-    return [c.name + (" rolling" if c in rolling else "") for c in phase.formation.contacts]
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:

@@ -18,9 +18,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Flags, sort_unique
 from ..scene.model import Scene
 from .plan_record import ModeSpan
 from .torque import TorqueProfile
@@ -58,13 +57,11 @@ class TorqueChange:
         counts = [max(math.ceil(n), 1) for n in (lasts * self.decays.max()).tolist()]
         spans = zip(self.times[:-1], self.times[1:], counts, strict=True)
         breaks = np.concatenate([np.linspace(a, b, n + 1)[:-1] for a, b, n in spans])
-        breaks = np.append(breaks, self.duration)
-
-        def evaluate(t: Array) -> Array:
-            return self.before + self.share(t)[:, None] * (self.after - self.before)
-
+        breaks, change = np.append(breaks, self.duration), self.after - self.before
         # Pieces are as long as the shortest lag at most.
-        return TorqueProfile.fit(breaks, evaluate, 6 if fades else 1)
+        return TorqueProfile.fit(
+            breaks, lambda t: self.before + self.share(t)[:, None] * change, 6 if fades else 1
+        )
 
 
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
@@ -186,7 +183,7 @@ class HeldMotion:
             t = np.append(t, self.end + sort_unique(self.dwell.breaks[[0, -2, -1]]))
         return t, self._evaluate(t, np.arange(len(t)) >= count)
 
-    def _evaluate(self, t: Array, held: NDArray[np.bool_]) -> Samples:
+    def _evaluate(self, t: Array, held: Flags) -> Samples:
         """Samples, of which some are those of the dwell."""
         samples = self.motion.evaluate(np.clip(t - self.begin, 0.0, self.motion.duration))
         if self.pause is not None:

@@ -114,11 +114,12 @@ class TorqueProfile:
         return TorqueProfile(np.concatenate(breaks), np.concatenate(wide))
 
     @staticmethod
-    def join_rows(t: Array, tau: Array) -> TorqueProfile:
-        """Linear torques between rows; two rows at one time are a step there.
+    def join_rows(rows: Array) -> TorqueProfile:
+        """Linear torques between rows t, tau1, tau2, shape (n, 3) [s, N m, N m].
 
-        Times t, (n,) [s], never decrease, and increase somewhere; tau is (n, 2) [N m].
+        Times never decrease, and increase somewhere. Two rows at one time are a step there.
         """
+        t, tau = rows[:, 0], rows[:, 1:]
         pieces = np.flatnonzero(np.diff(t) > 0)
         middle, half = (tau[pieces] + tau[pieces + 1]) / 2, (tau[pieces + 1] - tau[pieces]) / 2
         breaks = np.append(t[pieces], t[-1])
@@ -162,7 +163,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
         raise InputError(str(path), "t", "a time is given three times; twice makes a step")
     if t[-1] == 0.0:
         raise InputError(str(path), "t", "every time is 0; the torques must last")
-    return TorqueProfile.join_rows(t, values[:, 1:])
+    return TorqueProfile.join_rows(values)
 
 
 def read_notes(path: str) -> dict[str, str]:
@@ -261,11 +262,6 @@ def format_rows(rows: Array, commands: Array | None = None) -> str:
         notes.append(f"# {' and '.join(COMMANDS)}: tau + actuator_lag d tau / dt, in N m")
     lines = [*notes, ",".join(columns), *(",".join(map(repr, row)) for row in rows.tolist())]
     return "\n".join(lines) + "\n"
-
-
-def read_rows(rows: Array) -> TorqueProfile:
-    """The torques that rows say."""
-    return TorqueProfile.join_rows(rows[:, 0], rows[:, 1:])
 
 
 def _divide(torque: TorqueProfile, error: float) -> Array:

@@ -10,9 +10,9 @@ from itertools import compress
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Flags, Numbers, sort_unique
 from ..common.document import Drawn, restore
 from ..common.errors import InputError
 from ..common.files import read_arrays, require_ending, write_text, write_whole
@@ -79,7 +79,7 @@ class Trajectory(Drawn):
     # (n, m) [N]: NaN where a contact is not in the formation, or at rest, where none is determined
     c_n: Array
     c_t: Array
-    phase: NDArray[np.int64]  # (n,): index of the phase, from 0
+    phase: Numbers  # (n,): index of the phase, from 0
     torque: TorqueProfile  # exact between samples, with every step at a break
     # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant;
     # those of a loaded one interpolate the samples.
@@ -109,12 +109,12 @@ class Trajectory(Drawn):
         return np.append(self.t[first], self.t[-1])
 
     @property
-    def held(self) -> NDArray[np.bool_]:
+    def held(self) -> Flags:
         """Where everything waits at rest, and no forces are known, shape (n,)."""
         return np.asarray(np.isnan(self.c_n).all(axis=1))
 
     @property
-    def rolling(self) -> NDArray[np.bool_]:
+    def rolling(self) -> Flags:
         """Which contacts roll, shape (n, m), as `meta` names them by phases and modes."""
         mask, starts = np.zeros(self.c_t.shape, dtype=bool), self.phase_starts
         for index, names in enumerate(self.meta.get("rolling", [])):
@@ -150,7 +150,7 @@ class Trajectory(Drawn):
                 whole[rows] = values
         return fields
 
-    def find_steps(self) -> NDArray[np.int64]:
+    def find_steps(self) -> Numbers:
         """Rows before which forces step, shape (k,).
 
         At a new phase, a step of the torques, and where a sliding direction is reversed. Steps of
@@ -216,7 +216,7 @@ class SampledMotion:
 
 
 def interpolate_quintic(
-    h: Array, run: Array, knots: Sequence[Array], left: NDArray[np.int64]
+    h: Array, run: Array, knots: Sequence[Array], left: Numbers
 ) -> tuple[Array, Array, Array]:
     """Quintic through z, z' and z'' at two knots, with its first two derivatives.
 
@@ -243,7 +243,7 @@ def interpolate_quintic(
 
 
 def sample_phases(
-    t: Array, phase: NDArray[np.int64], samples: Samples, contacts: tuple[str, ...]
+    t: Array, phase: Numbers, samples: Samples, contacts: tuple[str, ...]
 ) -> tuple[SampledMotion, ...]:
     """The motion of each phase, from all samples of a trajectory."""
     motions = []

@@ -98,11 +98,6 @@ def find_unit_hint(scene: Scene) -> str:
     return ""
 
 
-def check_place(scene: Scene, key: str, value: float) -> None:
-    """Check a coordinate x of the object [m]; raises like `check_ranges`."""
-    PLACE.check(key, value, "m", scene)
-
-
 def _read_corners(given: object, key: str) -> Array:
     if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
         raise InputError("", key, f"{given!r} is not a list of 3 or more points")
@@ -313,6 +308,19 @@ class Friction:
         return self.palm if finger is None else (self.finger1, self.finger2)[finger]
 
 
+class _OfFingers:
+    """A value of both fingers, which has the same name there, after some zeros."""
+
+    def __init__(self, zeros: int = 0) -> None:
+        self._zeros = (0.0,) * zeros
+
+    def __set_name__(self, _: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, scene: Scene, _: type) -> Array:
+        return np.array([*self._zeros, *(getattr(f, self._name) for f in scene.fingers)])
+
+
 class Scales(NamedTuple):
     """The scene's own units, which every tolerance is relative to."""
 
@@ -372,6 +380,13 @@ class Scene:
     control_period: float = 0.0
     control_hold: str = HOLDS[0]
 
+    viscous = _OfFingers(3)  # (5,) [N m s]: joint viscous friction B, a force on z' per speed
+    dry = _OfFingers(3)  # (5,) [N m]: joint dry friction D as a force on z
+    torque_limit = _OfFingers()  # (2,) [N m]
+    speed_limit = _OfFingers()  # (2,) [rad/s]: infinite where there is none
+    torque_rate_limit = _OfFingers()  # (2,) [N m/s]: infinite where there is none
+    actuator_lag = _OfFingers()  # (2,) [s]: time constants of the motors
+
     def __post_init__(self) -> None:
         read_keys(self)
         # Messages name a finger by its place here, whatever it was made as.
@@ -429,36 +444,6 @@ class Scene:
     def applied_force(self) -> Array:
         """Gravity as a force on z, shape (5,) [N, N m]: the vector g of the equations of motion."""
         return np.array([0.0, -self.weight, 0.0, 0.0, 0.0])
-
-    @property
-    def viscous(self) -> Array:
-        """Joint viscous friction B as a force on z' per speed, shape (5,) [N m s]."""
-        return np.array([0.0, 0.0, 0.0, *(finger.viscous for finger in self.fingers)])
-
-    @property
-    def dry(self) -> Array:
-        """Joint dry friction D as a force on z, shape (5,) [N m]."""
-        return np.array([0.0, 0.0, 0.0, *(finger.dry for finger in self.fingers)])
-
-    @property
-    def torque_limit(self) -> Array:
-        """Torque limits, shape (2,) [N m]."""
-        return np.array([finger.torque_limit for finger in self.fingers])
-
-    @property
-    def speed_limit(self) -> Array:
-        """Joint speed limits, shape (2,) [rad/s], infinite where there is none."""
-        return np.array([finger.speed_limit for finger in self.fingers])
-
-    @property
-    def torque_rate_limit(self) -> Array:
-        """Limits of the torques' rates, shape (2,) [N m/s], infinite where there is none."""
-        return np.array([finger.torque_rate_limit for finger in self.fingers])
-
-    @property
-    def actuator_lag(self) -> Array:
-        """Time constants of the motors, shape (2,) [s]."""
-        return np.array([finger.actuator_lag for finger in self.fingers])
 
     @property
     def has_slow_motors(self) -> bool:

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 from PIL import Image, ImageColor
 
-from ..common.arrays import Array
+from ..common.arrays import Array, interpolate
 from ..common.document import fixed
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
@@ -68,9 +68,9 @@ def _prepare_scene(
         """Everything at an instant, in the order of drawing."""
         artists = list[Artist]()
         row = max(0, int(np.searchsorted(trajectory.t, t, side="right")) - 1)
-        z = _blend(trajectory.t, trajectory.z, t)
+        z = interpolate(t, trajectory.t, trajectory.z)
         if ghost is not None:
-            behind = _blend(ghost.t, ghost.z, t)
+            behind = interpolate(t, ghost.t, ghost.z)
             artists += snapshots.draw_bodies(axes, scene, behind, ec=GHOST, fc="none")
         artists += snapshots.draw_bodies(axes, scene, z)
         places = snapshots.turn(z, np.array([*numbers.values()]).reshape(-1, 2))
@@ -80,8 +80,7 @@ def _prepare_scene(
             artists.append(axes.text(x, y, str(k), **look))
         pressing = np.flatnonzero(presses[row]).tolist()
         for k in pressing:
-            cone = Polygon(cones[row, k], fc=colours[k], alpha=0.2, lw=0)
-            artists.append(axes.add_artist(cone))
+            artists.append(axes.add_artist(Polygon(cones[row, k], fc=colours[k], alpha=0.2, lw=0)))
         for k in pressing:
             arrow = _trace_arrow(points[row, k], arrows[row, k], 0.018 * size)
             artists.append(style.add_line(axes, arrow, color=colours[k], lw=1.8))
@@ -96,11 +95,6 @@ def _prepare_scene(
         return artists + snapshots.draw_joints(axes, scene)
 
     return draw
-
-
-def _blend(times: Array, values: Array, t: float) -> Array:
-    """Values at `t`, straight between samples."""
-    return np.array([np.interp(t, times, column) for column in values.T])
 
 
 def _trace_arrow(start: Array, along: Array, head: float) -> Array:

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, Numbers, find_runs
 from ..common.document import plain
-from ..contacts.closing import Numbers
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory

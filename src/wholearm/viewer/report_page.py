@@ -224,10 +224,9 @@ def write_gallery(
         write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
         report = verify(plan.problem, plan)
         gap = "" if report.finger_gap is None else report.finger_gap.least
-        forces = (contact.least for phase in report.phases for contact in phase.contacts)
-        least = min(force for force in forces if force == force)
+        least, _ = report.least_force
         verdict = "ok" if report.ok else "FAILED"
-        rows.append((name, len(plan.phases), plan.value, least, gap, verdict))
+        rows.append((name, len(plan.phases), plan.value, least and least.least, gap, verdict))
         place = f"{os.path.basename(folder)}/{name}"
         links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
         pictures.append(f"## {plan.problem.name}\n\n{links}")

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array, find_runs
+from ...common.arrays import Array, find_runs, interpolate
 from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
@@ -720,10 +720,8 @@ def _guess(
         )
         place = (place - ends[0]) / span
         rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
-        z, slope, bend = (
-            np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
-            for table in (outline.z, slopes, bends)
-        )
+        tables = outline.z, slopes, bends
+        z, slope, bend = (interpolate(place, knots, table) for table in tables)
         return z, slope * rate, slope * gain + bend * rate**2
 
     duration, c = total * (clock[1] - clock[0]), None
