@@ -495,7 +495,7 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
         pytest.importorskip(module, reason=f"{method}: pip install 'wholearm[bench]'")
     (study, *_) = precision.PLANNERS[method].choices
     instance = phase(4, study != precision.NO_DRAG)
-    found = precision.run_planner(instance, method, TRIED[method])
+    found = precision.run_setting(instance, study, method, TRIED[method])
     error, end, violation = found["errors"]
     assert found["outcome"] == precision.SOLVED and abs(error) < 2e-2
     assert end < 1e-2 and violation < 2.6e-2

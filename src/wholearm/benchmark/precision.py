@@ -134,19 +134,32 @@ class Method(NamedTuple):
     module: str = ""  # what has to be installed, if anything
 
 
-def measure(build: Callable[[], Any], judge: Callable[[Any], tuple[tuple[float, ...], str]]) -> Row:
-    """Build and run: `build` and `solve` are the times that takes [s], `judge` says the rest.
+def run_setting(instance: Instance, study: str, method: str, setting: str) -> Row:
+    """Run one setting of one method on one phase; nothing of a simulator without a course.
 
-    These are the `errors`, of a simulation of the state, relative to the scene, of a plan those of
-    the phase time, of the replayed end state, and the worst violation of a limit between nodes; and
-    the `outcome`, `SOLVED` or what failed.
+    `build` and `solve` are the times that takes [s]. The `errors` are of a simulation that of the
+    state, relative to the scene, of a plan those of the phase time, of the replayed end state, and
+    the worst violation of a limit between nodes; the `outcome` is `SOLVED` or what failed.
     """
+    subject = instance if study in PLANNING else make_course(instance, study)
+    if subject is None:
+        return {}
+    own, least = METHODS[method], find_least_time(instance) if study in PLANNING else math.nan
+    if own.module:
+        # No timing is to include the import.
+        __import__(own.module)
     with warnings.catch_warnings():
         # Warnings of peers are not ours.
         warnings.simplefilter("ignore")
-        built, run = _time(build)
+        built, run = _time(partial(own.build, subject, setting))
         took, answer = _time(run)
-    errors, outcome = judge(answer)
+    if isinstance(subject, Course):
+        errors = [measure_error(subject.problem, answer, subject.end)]
+        outcome = SOLVED if np.isfinite(errors[0]) else "no finite state"
+    else:
+        *checked, outcome = check_plan(instance, answer)
+        late = math.nan if isinstance(answer, str) else answer.duration / least - 1
+        errors = [late, *checked]
     return {"build": built, "solve": took, "errors": errors, "outcome": outcome}
 
 
@@ -320,19 +333,6 @@ SIMULATORS = {
 }
 
 
-def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Row:
-    """Run one setting of one simulator on one phase; nothing if the phase has no course."""
-    course = make_course(instance, study)
-    if course is None:
-        return {}
-
-    def judge(state: Array) -> tuple[tuple[float, ...], str]:
-        error = measure_error(course.problem, state, course.end)
-        return (error,), SOLVED if np.isfinite(error) else "no finite state"
-
-    return measure(partial(SIMULATORS[method].build, course, setting), judge)
-
-
 @lru_cache(maxsize=64)
 def make_course(instance: Instance, study: str) -> Course | None:
     """The course of a phase: of 95 % of its last stretch, as just before a stop all is ill-posed.
@@ -397,21 +397,6 @@ def build_plant(formation: Formation) -> Expression:
     acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
     missed = P @ acceleration + P_dot_v
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
-
-
-def run_planner(instance: Instance, method: str, setting: str) -> Row:
-    """Run one setting of one planner on one phase, and check its plans."""
-    if module := PLANNERS[method].module:
-        # No timing is to include the import.
-        __import__(module)
-    least = find_least_time(instance)
-
-    def judge(plan: Plan) -> tuple[tuple[float, ...], str]:
-        end, violation, outcome = check_plan(instance, plan)
-        error = math.nan if isinstance(plan, str) else plan.duration / least - 1
-        return (error, end, violation), outcome
-
-    return measure(partial(PLANNERS[method].build, instance, setting), judge)
 
 
 @lru_cache(maxsize=64)
@@ -783,10 +768,7 @@ class Precision(Study):
         study, name, method, setting, files = case
         instances = list_instances(files, study != NO_DRAG)
         instance = next(instance for instance in instances if instance.name == name)
-        if study in PLANNING:
-            measured = run_planner(instance, method, setting)
-        else:
-            measured = run_simulator(instance, study, method, setting)
+        measured = run_setting(instance, study, method, setting)
         return dict(zip(self.columns[:4], case, strict=False)) | measured
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
