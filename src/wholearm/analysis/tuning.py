@@ -7,7 +7,7 @@ is reached; the instant of a brake is found by false position in the arrival spe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
@@ -383,13 +383,9 @@ class PassageTuner:
 
     def halve(self) -> tuple[Passage, Passage] | None:
         """Both halves of the way, the first until x or phi is what it is there."""
-        phases, paths, z = self.passage.phases, list[PathSamples](), self.z
-        for phase in phases:
-            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
-            if path is None:
-                return None
-            paths.append(path)
-            z = path.point.z[-1]
+        phases, paths = self.passage.phases, list(self._follow(self.passage.phases, self.z))
+        if len(paths) < len(phases):
+            return None
         ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
         path, left = paths[k], ends[k] - ends[-1] / 2
@@ -496,21 +492,23 @@ class PassageTuner:
 
         And the index of the torque with the most work: the finger behind the motion.
         """
-        tau: list[Array] = []
-        work: list[Array] = []
-        for phase in phases:
-            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
-            torques = None
-            if path is not None:
-                torques = find_torques(path, self.problem.epsilon, self.options.squeeze)
-            if path is None or torques is None:
+        tau, work = list[Array](), list[Array]()
+        for path in self._follow(phases, z):
+            torques = find_torques(path, self.problem.epsilon, self.options.squeeze)
+            if torques is None:
                 break
             tau.append(torques.tau)
             work.append(torques.tau * path.point.z_s[:, 3:])
+        return (np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())) if tau else None
+
+    def _follow(self, phases: Sequence[Phase], z: Array) -> Iterator[PathSamples]:
+        """Paths of phases from `z` on, up to one with other than one or two freedoms."""
+        for phase in phases:
+            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
+            if path is None:
+                return
+            yield path
             z = path.point.z[-1]
-        if not tau:
-            return None
-        return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())
 
     def _sum_up(self, own: PhaseTuning, trial: TuningTrial, **more: Any) -> PhaseTuning:
         """The tuning with the numbers of a trial, and what it took."""
