@@ -12,7 +12,7 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -317,28 +317,16 @@ def _at_rest(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Rou
     return phases, stops, "from the map"
 
 
-def _struck(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
-    """Impacts wherever a contact is gained that the next phase has."""
-    changed = [
-        dict(phase, end="impact")
-        if isinstance(phase["until"], str)
-        and phase["until"] in following["contacts"]
-        and set(following["contacts"]) <= {*phase["contacts"], phase["until"]}
-        else phase
-        for phase, following in itertools.pairwise(phases)
-    ]
-    return [*changed, phases[-1]], stops, "impacts"
-
-
-def _joined(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
-    """Smooth ends wherever a phase passes into one with three contacts or fewer freedoms."""
+def _joined(rng: Random, problem: Problem, phases: Phases, stops: Stops, end: str) -> Route:
+    """Impacts wherever the next phase has the gained contact, or smooth ends where it has less."""
     changed = []
     for phase, following in itertools.pairwise(phases):
         gained = {phase["until"]} if isinstance(phase["until"], str) else set()
-        fits = set(following["contacts"]) <= {*phase["contacts"], *gained}
-        less = len(following["contacts"]) < len(phase["contacts"]) + len(gained)
-        changed.append(dict(phase, end="smooth") if fits and less and len(phases) < 5 else phase)
-    return [*changed, phases[-1]], stops, "smooth"
+        before, after = {*phase["contacts"], *gained}, set(following["contacts"])
+        less = len(after) < len(phase["contacts"]) + len(gained) and len(phases) < 5
+        fits = bool(gained) and gained <= after if end == "impact" else less
+        changed.append(dict(phase, end=end) if fits and after <= before else phase)
+    return [*changed, phases[-1]], stops, "impacts" if end == "impact" else end
 
 
 def _split(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
@@ -374,5 +362,6 @@ def _rolled(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Rout
     return [slide, rolling], [], "rolling"
 
 
-ROUTES = (_at_rest, _at_rest, _struck, _joined, _split, _rolled)
+_struck, _smoothed = (partial(_joined, end=end) for end in ("impact", "smooth"))
+ROUTES = (_at_rest, _at_rest, _struck, _smoothed, _split, _rolled)
 """Problems that are made of a list from the map."""
