@@ -102,11 +102,11 @@ class CurveLaw:
     ) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
-        self.starts = list(tables.get("starts", ())) or [0.0]
+        self.starts = tables["starts"].tolist() or [0.0]
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
-        self.keeps = bool(tables.get("keeps", [0.0])[0])
+        self.keeps = bool(tables["keeps"][0])
         pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
         self.steps = [after - before for before, after in pairs]
         self.borders = [self.nodes.index(start) for start in self.starts[1:]]

@@ -87,10 +87,10 @@ class Policy(Result):
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
             entries = phases[first - 1 : first - 1 + len(law.starts)]
             names = [list(entry.get("reserves", {})) for entry in entries]
-            table = arrays.get("forces", np.zeros((0, 2, 0, 5)))
-            if isinstance(law, CurveLaw) and {len(each) for each in names} == {table.shape[2]}:
+            known = {len(each) for each in names}
+            if isinstance(law, CurveLaw) and known == {arrays["forces"].shape[2]}:
                 late, gained = self.settings.delay / self.settings.period, entries[-1]["gained"]
-                law.sensing = Sensing(names, gained, table, late)
+                law.sensing = Sensing(names, gained, arrays["forces"], late)
                 contacts.update(dict.fromkeys(chain(*names, [gained] if gained else [])))
         self.contacts = list(contacts)
         self.reset()
@@ -270,13 +270,10 @@ def _read_tables(
     """Checked tables of a law."""
     tables = {}
     for name, shape in shapes.items():
-        key = f"{name}_{number}"
-        if key not in arrays and name in LATER:
-            tables[name] = np.zeros([max(n, 0) for n in shape])
-            continue
-        if key not in arrays:
+        key, none = f"{name}_{number}", np.zeros([max(n, 0) for n in shape])
+        array = arrays.get(key, none if name in LATER else None)
+        if array is None:
             raise InputError(source, key, "array is missing")
-        array = arrays[key]
         fits = array.dtype.kind == "f" and array.ndim == len(shape) and np.isfinite(array).all()
         if not fits or any(w not in (-1, n) for w, n in zip(shape, array.shape, strict=True)):
             needed = ", ".join("any" if n < 0 else str(n) for n in shape)

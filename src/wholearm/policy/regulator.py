@@ -11,7 +11,7 @@ with one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
@@ -171,8 +171,14 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
 
     Accelerations and forces are those of the torques: between the samples of a loaded plan they
     step where modes change.
+
+    InputError if the plan has no spans of contact modes of the phase, as one along a curve.
     """
-    spans, names = list_modes(phase, plan), phase.formation.names
+    phases, names = plan.meta.get("modes", []), phase.formation.names
+    spans = phases[phase.index] if phase.index < len(phases) else ()
+    if not spans:
+        text = f"has no spans of phase {phase.number}, which the policy follows over time"
+        raise InputError("", "meta.modes", text)
     begins = [span["start"] for span in spans[1:]]
     owner = np.searchsorted(begins, t - plan.phase_starts[phase.index], side="right")
     for k in sorted(set(owner.tolist())):
@@ -194,18 +200,6 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         margins = np.where(torque, ROOM, PRESS * weights)
         levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
         yield RegulatedStretch(formation, z, v, directions, forces, levels)
-
-
-def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
-    """Spans of constant contact modes of a phase, as `ModeSpan`; the first begins with the phase.
-
-    InputError if the plan has none, as one along a curve.
-    """
-    modes = plan.meta.get("modes", [])
-    if phase.index >= len(modes) or not modes[phase.index]:
-        text = f"has no spans of phase {phase.number}, which the policy follows over time"
-        raise InputError("", "meta.modes", text)
-    return tuple(modes[phase.index])
 
 
 def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
