@@ -352,11 +352,6 @@ class ReferencePiece(NamedTuple):
     b: Array  # (n,) [m^2/s^2]: the reference
 
     @property
-    def duration(self) -> float:
-        """Duration of the reference [s]."""
-        return float(find_duration(self.b, np.diff(self.rows.s)))
-
-    @property
     def presses_at_rest(self) -> bool:
         """Whether torques of its motion press all contacts with no speed wanted at the start.
 
@@ -612,18 +607,15 @@ def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str
 
 def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array]:
     """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
-    length = one["s"][-1]
-    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("theta", "b")}
-    joined["s"] = np.concatenate([one["s"], length + two["s"][1:]])
-    joined["starts"] = np.concatenate([one["starts"], length + two["starts"]])
-    for name in ("torque", "forces"):
+    two = {**two, **{name: one["s"][-1] + two[name] for name in ("s", "starts")}}
+    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("s", "theta", "b")}
+    for name in ("starts", "torque", "forces"):
         joined[name] = np.concatenate([one[name], two[name]])
     parts = one["levels"], two["levels"]
-    levels = np.tile(UNLIMITED, (len(joined["s"]) - 1, 2, max(p.shape[2] for p in parts), 1))
-    for part, span in zip(parts, (slice(len(parts[0])), slice(len(parts[0]), None)), strict=True):
-        levels[span, :, : part.shape[2]] = part
-    joined["levels"] = levels
-    return {**two, **joined}
+    most = max(part.shape[2] for part in parts)
+    missing = [np.tile(UNLIMITED, (len(p), 2, most - p.shape[2], 1)) for p in parts]
+    wide = [np.concatenate(pair, axis=2) for pair in zip(parts, missing, strict=True)]
+    return {**two, **joined, "levels": np.concatenate(wide)}
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -710,20 +702,18 @@ def make_policy(
     pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block in blocks:
-        lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
-        entries: list[dict[str, Any]] = [
-            {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
-        ]
+        for phase in block:
+            lasts = float(np.diff(starts)[phase.index])
+            about.append({"number": phase.number, "plan": lasts, "duration": lasts, "share": 0.0})
         if block[0].index not in pieces:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
-            for one, span in zip(entries, np.diff(ends).tolist(), strict=True):
-                one["duration"] = span
-            entries[-1]["duration"] += settings.dwell + delay
-            about += entries
+            for entry, span in zip(about[-len(block) :], np.diff(ends).tolist(), strict=True):
+                entry["duration"] = span
+            about[-1]["duration"] += settings.dwell + delay
             continue
         goes_on = False
-        for phase, entry in zip(block, entries, strict=True):
+        for phase, entry in zip(block, about[-len(block) :], strict=True):
             piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
             push, hold = plan.tau[last], None
             if not np.isnan(plan.c_n[last]).all():
@@ -736,14 +726,14 @@ def make_policy(
             table = _tabulate_curve(piece, push, keeps)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = phase.end is End.SMOOTH
-            entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
+            entry.update(duration=lasts, share=piece.share, reserves=piece.reserves)
             # The plan goes on in motion there.
             planned_end = phases[phase.index].end
             entry["stops"] = phase.end is End.REST and planned_end is not End.REST
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
             if not piece.passes:
                 entry["duration"] += settings.dwell + delay
-        about += entries
     duration = sum(phase["duration"] for phase in about)
     whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:
