@@ -137,9 +137,8 @@ class Method(NamedTuple):
 def run_setting(instance: Instance, study: str, method: str, setting: str) -> Row:
     """Run one setting of one method on one phase; nothing of a simulator without a course.
 
-    `build` and `solve` are the times that takes [s]. The `errors` are of a simulation that of the
-    state, relative to the scene, of a plan those of the phase time, of the replayed end state, and
-    the worst violation of a limit between nodes; the `outcome` is `SOLVED` or what failed.
+    `build` and `solve` are the times that takes [s], `errors` that of the state at the end, or of
+    the phase time and as of `check_plan`.
     """
     subject = instance if study in PLANNING else make_course(instance, study)
     if subject is None:
@@ -358,13 +357,9 @@ def make_course(instance: Instance, study: str) -> Course | None:
 
 
 def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
-    """Replay a plan.
+    """Error of the replayed end state, worst violation, and `SOLVED` or why the plan is none.
 
-    Returns
-    -------
-    end        error of the end state, relative to the scene
-    violation  worst of c_n >= epsilon, over the scene's force, or of a torque limit, over it
-    outcome    `SOLVED`, or why the plan is none
+    The violation is of c_n >= epsilon, over the scene's force, or of a torque limit, over it.
     """
     if isinstance(plan, str):
         return math.nan, math.nan, plan

@@ -146,12 +146,9 @@ def find_room(formation: Formation, z: Array) -> dict[str, Array]:
 
 
 def resample(formation: Formation, trace: Trace, count: int) -> tuple[Array, Array, Array]:
-    """The curve at even places, and also where a contact or a joint turns.
+    """Arc lengths s, (n,) [m], z and unit tangents z_s, (n, 5), at even places of a curve.
 
-    Returns
-    -------
-    s : (n,) [m]     arc length
-    z, z_s : (n, 5)  configurations, and unit tangents along the way
+    And also where a contact or a joint turns.
     """
 
     def slide(s: Array) -> Array:

@@ -513,9 +513,10 @@ def retime_within(
     least: float,
     end: tuple[float, float] | None = None,
 ) -> tuple[tuple[CurveLimitRows, ControllableSet] | None, float]:
-    """The fastest motion that keeps its limits within the largest feasible share of ranges.
+    """The law's limits and the fastest motions that keep them within a share of ranges; the share.
 
-    Fixed-point iteration between the worst corners of the ranges and the motion.
+    It is the largest feasible one. Fixed-point iteration between the worst corners of the ranges
+    and the motion.
 
     Parameters
     ----------
@@ -524,10 +525,6 @@ def retime_within(
     widths        half widths of the ranges; that of the delay is its unknown part
     least : [N]   least normal force within them
     end           as of `retime`
-
-    Returns
-    -------
-    tuple  the law's limits and the motions, None if there are none; and the share of the ranges
     """
 
     def find(share: float) -> tuple[CurveLimitRows, ControllableSet] | None:

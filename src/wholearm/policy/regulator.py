@@ -90,16 +90,10 @@ class RegulatedStretch(NamedTuple):
     levels: Array  # (n, m, 5): limits over their margins, coefficients as of `forces`
 
     def scale(self, b: float) -> tuple[float, Array, Array]:
-        """The plan with its squared speed times `b`, with the best internal force.
+        """Least level, c, (n, n_c + R) [N], and tau, (n, 2) [N m], at `b` times the squared speed.
 
-        Where a contact rolls that of the plan would let it slip at another speed. Case: query 1,
-        phase 5.
-
-        Returns
-        -------
-        level : float  least of the limits over their margins
-        c : (n, n_c + R) [N]
-        tau : (n, 2) [N m]
+        With the best internal force: that of the plan would let a rolling contact slip at another
+        speed. Case: query 1, phase 5.
         """
         zero, b_of_all = np.zeros(len(self.z)), np.full(len(self.z), b)
         level, internal = find_internal_force(self.levels, zero, b_of_all)
@@ -127,15 +121,10 @@ def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
 def follow(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
 ) -> tuple[float, Array, Array, bool]:
-    """Squared speed over the plan's, torques and gains at even times in phases of a plan, (n,).
+    """Squared speed over the plan's, tau, (n, 2) [N m], and gains, (n, 2, 4), at n even times.
 
-    The speed is that with the largest least margin of normal forces and torques.
-
-    Returns
-    -------
-    b : float
-    tau, gains : (n, 2) [N m] and (n, 2, 4)
-    slow : bool  whether the last torques press all contacts in a slow motion
+    The speed is that with the largest least margin of normal forces and torques. Last comes whether
+    the last torques press all contacts in a slow motion.
     """
     starts, t = plan.phase_starts, end_within(phases, plan, t)
     step = float(t[1] - t[0])
