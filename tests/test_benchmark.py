@@ -88,7 +88,7 @@ def test_records_of_other_code_do_not_count_where_that_matters(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = load_study("steps")
-    monkeypatch.setattr(study, "of_code", True, raising=False)
+    monkeypatch.setattr(study, "stamp", lambda options: {"source": digest_source()})
     command = ["bench", "steps", "-o", str(tmp_path), "--jobs", "1", "--most", "2"]
     path = tmp_path / "bench_steps.jsonl"
     main(command)

@@ -192,21 +192,18 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
 
 def have_same_signs(before: Directions, after: Directions) -> Array:
     """Where directions before and after the nearest reversal are equal, shape (n,)."""
-    same = [(one == other).all(axis=1) for one, other in zip(before, after, strict=True)]
-    return np.asarray(same[0] & same[1])
+    return np.asarray((np.hstack(before) == np.hstack(after)).all(axis=1))
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
     """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
-    first = curve.segments[0]
-    pairs = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
-    for before, after in pairwise(curve.segments):
+    signs = [np.append(part.Xi, part.sigma) for part in curve.segments]
+    blended = np.tile(signs[0], (3, len(s), 1))
+    for before, (one, other) in zip(curve.segments, pairwise(signs), strict=False):
         near = max(float(np.interp(before.stop, s, width)), 1e-3 * curve.length)
         share = np.clip(0.5 + (s - before.stop) / (2 * near), 0.0, 1.0)[:, None]
-        for directions, part in zip(pairs, (share, np.floor(share), np.ceil(share)), strict=True):
-            directions[0] += part * (after.Xi - before.Xi)
-            directions[1] += part * (after.sigma - before.sigma)
-    return [Directions(*directions) for directions in pairs]
+        blended += np.stack([share, np.floor(share), np.ceil(share)]) * (other - one)
+    return [Directions(*np.split(each, [-2], axis=1)) for each in blended]
 
 
 class Corners(NamedTuple):

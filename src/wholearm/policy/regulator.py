@@ -334,8 +334,7 @@ def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Proble
         (block, *later), replacement = blocks, list[PhaseParts]()
         if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
             for stop, share, longest in STOPS:
-                stopped = _stop(block, plan, stop)
-                if stopped:
+                if stopped := _stop(block, plan, stop):
                     rest = [*stopped, *later]
                     replacement = _replan_blocks(planner, problem, rest, plan, share, longest)
                 if replacement:
