@@ -37,7 +37,6 @@ from scipy.integrate import solve_ivp
 from ..common.arrays import Array, Expression
 from ..common.document import Table
 from ..common.errors import InputError
-from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
@@ -55,7 +54,6 @@ from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
-from ..scene.model import Scene
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
 from .study import Case, Findings, Row, Study
@@ -180,22 +178,16 @@ def find_mean(seconds: Sequence[float]) -> float:
 
 
 def solve_motion(
-    scene: Scene,
-    contacts: Sequence[Contact],
-    z: Array,
-    z_dot: Array,
-    tau: Array,
-    Xi: Array,
-    sigma: Array,
+    formation: Formation, z: Array, z_dot: Array, tau: Array, Xi: Array, sigma: Array
 ) -> tuple[Array, Array]:
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
     the contact conditions differentiated twice: rates of their rows by complex steps.
     """
-    tiny = 1e-30  # [s]
+    tiny, scene = 1e-30, formation.scene  # [s]
     ahead = (z + 1j * tiny * z_dot)[None]
-    touches = [locate(scene, contact.name, ahead) for contact in contacts]
+    touches = [locate(scene, name, ahead) for name in formation.names]
     rows = np.array([touch.normal[0] for touch in touches])
     slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
     friction = scene.viscous * z_dot + scene.dry * np.append(np.zeros(3), sigma)
@@ -233,7 +225,7 @@ def integrate(
     piece column by column, its ends, and those of the stretch. Contacts stay closed: those that are
     lost pull.
     """
-    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments]
+    parts = [*curve.segments]
     y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
         profile = torque.cut(t, stop)
@@ -245,7 +237,7 @@ def integrate(
                 t: float, y: Array, part: Segment = part, own: TorqueProfile = profile
             ) -> tuple[Array, Array]:
                 tau = own.at(np.array([t]))[0]
-                return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+                return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
 
             def rates(t: float, y: Array, solve: Any = solve) -> Array:
                 return np.concatenate([y[5:], solve(t, y)[0]])

@@ -95,10 +95,7 @@ class CurveLaw:
     """
 
     def __init__(
-        self,
-        tables: Mapping[str, Any],
-        settings: LoopSettings,
-        following: CurveLaw | MotionLaw | None = None,
+        self, tables: Mapping[str, Any], settings: LoopSettings, following: Law | None = None
     ) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
@@ -426,10 +423,7 @@ class MotionLaw:
     passes = False
 
     def __init__(
-        self,
-        tables: Mapping[str, Any],
-        settings: LoopSettings,
-        following: CurveLaw | MotionLaw | None = None,
+        self, tables: Mapping[str, Any], settings: LoopSettings, following: Law | None = None
     ) -> None:
         self.settings, self.starts = settings, tables["starts"].tolist()
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
@@ -521,6 +515,9 @@ class MotionLaw:
         place = min(max(t, 0.0), self.end) / self.every
         k = min(int(place), len(self.theta) - 2)
         return k, min(place - k, 1.0)
+
+
+Law = CurveLaw | MotionLaw
 
 
 class Sensing:

@@ -14,7 +14,7 @@ from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, require_number
 from ..common.files import read_arrays, require_ending, write_whole
-from .curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing
+from .curve_law import CurveLaw, Law, LoopSettings, MotionLaw, Sensing
 
 FORMAT = 1  # Version of the files
 CURVE = {
@@ -32,7 +32,6 @@ MOTION = {
 LATER = ("ways", "forces", "keeps", "starts", "approach")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
-Law = CurveLaw | MotionLaw
 
 
 class Policy(Result):
