@@ -33,7 +33,6 @@ from ..mechanics.dynamics import (
     inverse,
     metric_weights,
     reduced_inertia,
-    split_forces,
 )
 from ..mechanics.limits import CONE, PRESS
 from ..mechanics.path_limits import InternalForceLimits
@@ -182,8 +181,7 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
     # At the largest least force the span is one point, but for rounding.
     middle = np.where(low <= high, np.clip(lightest, low, high), best.internal_force)
     internal = np.where(size > 0, middle, 0.0)
-    c = forces.c(zero, zero, internal)
-    c_n, _ = split_forces(path.phase.formation, c, path.directions.Xi)
+    c_n = forces.c(zero, zero, internal)[:, : path.phase.formation.n_contacts]
     return QuasistaticTorques(path.s, path.point.z, forces.tau(zero, zero, internal), c_n)
 
 
