@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import ceil, inf, isfinite, sqrt
 from typing import Any, NamedTuple
 
@@ -104,18 +105,19 @@ class CurveLaw:
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
         self.keeps = bool(tables["keeps"][0])
-        pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
-        self.steps = [after - before for before, after in pairs]
+        self.steps = [after - before for before, after in pairwise(self.nodes)]
         self.borders = [self.nodes.index(start) for start in self.starts[1:]]
-        self.chords = [
-            (after[0] - before[0], after[1] - before[1])
-            for before, after in zip(self.theta, self.theta[1:], strict=False)
-        ]
+        self.chords = [(c - a, d - b) for (a, b), (c, d) in pairwise(self.theta)]
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
         # Speeds by chords would step at nodes where joint angles bend. Case: hexagon, phase 5.
         self.slopes = np.gradient(tables["theta"], tables["s"], axis=0).tolist()
         self.levels, self.torque = _split(tables["levels"], most=1e6), _split(tables["torque"])
-        self.floor = self._find_floor()
+        # Level on each interval below which feedback is reduced.
+        self.floor = list[float]()
+        for j, (h, ends) in enumerate(zip(self.steps, pairwise(self.b), strict=True)):
+            rows = [_evaluate(self.levels[j], k, sqrt(b)) for k, b in enumerate(ends)]
+            level = min(_choose_at(each, (ends[1] - ends[0]) / (2 * h))[0] for each in rows)
+            self.floor.append(min(LAW.level, LAW.part * level))
         self.gain = LAW.gain / (settings.period + settings.delay)
         self.memory = LAW.integral * self.gain**2 * settings.period
         self.beyond = LAW.beyond * settings.touch
@@ -258,17 +260,6 @@ class CurveLaw:
         """The reference's b at a place near interval `j`."""
         j, share = self._locate(j, s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
-
-    def _find_floor(self) -> list[float]:
-        """Level on each interval below which feedback is reduced."""
-        floors = []
-        for j, h in enumerate(self.steps):
-            ends = self.b[j : j + 2]
-            a = (ends[1] - ends[0]) / (2 * h)
-            rows = [_evaluate(self.levels[j], k, sqrt(b)) for k, b in enumerate(ends)]
-            level = min(_choose_at(each, a)[0] for each in rows)
-            floors.append(min(LAW.level, LAW.part * level))
-        return floors
 
     def _list_levels_across(
         self, torques: Sequence[Row], j: int, share: float, v: float

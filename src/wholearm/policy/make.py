@@ -183,16 +183,12 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
         error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
         unit.append(SETTINGS.least * contact.side_scales + error)
-    slack[1][have_same_signs(*sides)] = UNLIMITED
+    before, after = map(np.hstack, sides)
+    slack[1][(before == after).all(axis=1)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
     unit.append(np.tile(SETTINGS.spare * joint.side_scales, (len(s), 1)))
     table, units = (np.concatenate(parts, axis=1) for parts in (slack, unit))
     return CurveLimitRows(s, torque, table, units, 2 * slack[0].shape[1])
-
-
-def have_same_signs(before: Directions, after: Directions) -> Array:
-    """Where directions before and after the nearest reversal are equal, shape (n,)."""
-    return np.asarray((np.hstack(before) == np.hstack(after)).all(axis=1))
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
@@ -333,7 +329,8 @@ def find_within(
     left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
     forces = np.maximum(SETTINGS.least * contact.side_scales, least)
     unit = np.concatenate([forces, SETTINGS.spare * joint.side_scales])
-    same = have_same_signs(*sides)
+    one, other = map(np.hstack, sides)
+    same = (one == other).all(axis=1)
     return Within(s, nominal, left, (corners[0], corners[1]), same, unit)
 
 
@@ -347,14 +344,6 @@ class ReferencePiece(NamedTuple):
     begins: float  # [m^2/s^2]: the plan's b at the start
     passes: float  # ratio of b after and before the end, passed in motion; zero at rest
     b: Array  # (n,) [m^2/s^2]: the reference
-
-    @property
-    def presses_at_rest(self) -> bool:
-        """Whether torques of its motion press all contacts with no speed wanted at the start.
-
-        Case without: new polygon 34, phase 10.
-        """
-        return float(find_internal_force(self.rows.levels[:1], np.zeros(1), np.zeros(1))[0][0]) > 0
 
     @property
     def reserves(self) -> dict[str, float]:
@@ -715,8 +704,11 @@ def make_policy(
                 push = push if hold is None else hold
             # Friction of the joints decides on rest where torques are not much larger.
             keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
-            after = pieces.get(phase.index + 1)
-            keeps |= hold is not None and after is not None and not after.presses_at_rest
+            if hold is not None and phase.index + 1 in pieces:
+                # Or if torques of the next motion press too little with no speed wanted at its
+                # start. Case: new polygon 34, phase 10.
+                levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
+                keeps |= bool(find_internal_force(levels, still, still)[0][0] <= 0)
             table = _tabulate_curve(piece, push, keeps)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = phase.end is End.SMOOTH

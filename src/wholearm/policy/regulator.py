@@ -112,12 +112,6 @@ def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array
     return level, internal
 
 
-def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
-    """Times in phases, kept below the end, at which the contacts of the next phase hold."""
-    end = plan.phase_starts[phases[-1].index + 1]
-    return np.asarray(np.minimum(t, np.nextafter(end, 0.0)))
-
-
 def follow(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
 ) -> tuple[float, Array, Array, bool]:
@@ -126,8 +120,7 @@ def follow(
     The speed is that with the largest least margin of normal forces and torques. Last comes whether
     the last torques press all contacts in a slow motion.
     """
-    starts, t = plan.phase_starts, end_within(phases, plan, t)
-    step = float(t[1] - t[0])
+    starts, step = plan.phase_starts, float(t[1] - t[0])
 
     def divide(t: Array) -> list[RegulatedStretch]:
         owner = np.searchsorted(starts, t, side="right") - 1
@@ -277,8 +270,10 @@ def tabulate_motion(
     starts = plan.phase_starts[phases[0].index : phases[-1].index + 2].copy()
     starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
     count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
-    t = np.linspace(starts[0], starts[-1], count + 1)
-    samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
+    # At the very end the contacts of the next phase hold.
+    within = np.nextafter(plan.phase_starts[phases[-1].index + 1], 0.0)
+    t = np.minimum(np.linspace(starts[0], starts[-1], count + 1), within)
+    samples, last = plan.at(t), phases[-1]
     hold = hold_end(problem, last, samples.z[-1])
     inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
     # At the end each joint is critically damped, in contact or not.
