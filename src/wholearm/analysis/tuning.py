@@ -432,7 +432,13 @@ class PassageTuner:
         own, drives = replace(own, quasistatic=self.scale(0)), self.drive()
         drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
-            return self._sum_up(own, self.trials[-1], reason=self._explain())
+            nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
+            text = f"no constant torques reach {self.passage.until}: the nearest trial "
+            text += nearest.to_text()
+            why = "up to the torque limit"
+            if last.outcome is TrialOutcome.LOSES:
+                why = f"and raised {len(self.trials) - 1} times it {last.to_text()}"
+            return self._sum_up(own, last, reason=f"{text}, {why}")
         if not self.options.brake:
             # The fastest that is held where it arrives; the slowest arrives most gently.
             held = None
@@ -515,15 +521,6 @@ class PassageTuner:
         more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
         more |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
         return replace(own, simulations=self.simulations, **more)
-
-    def _explain(self) -> str:
-        """Why no torque drives the object to the end."""
-        nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
-        text = f"no constant torques reach {self.passage.until}: the nearest trial "
-        text += nearest.to_text()
-        if last.outcome is TrialOutcome.LOSES:
-            return f"{text}, and raised {len(self.trials) - 1} times it {last.to_text()}"
-        return f"{text}, up to the torque limit"
 
     @property
     def is_exhausted(self) -> bool:

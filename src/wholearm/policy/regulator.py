@@ -130,11 +130,8 @@ def follow(
         ]
 
     parts = divide(t)
-
-    def find_margin(b: float) -> float:
-        return min(part.scale(b)[0] for part in parts)
-
-    b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
+    speeds = (1 - 0.05 * k for k in range(11))
+    b = max(speeds, key=lambda b: min(part.scale(b)[0] for part in parts))
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     # Mean torques of a period have the plan's impulse, also where it steps.
     within = np.clip(t[:, None] + step * (np.arange(8) - 3.5) / 8, t[0], t[-1]).ravel()
