@@ -364,9 +364,8 @@ def _compare(folder: Path, name: str) -> Row:
     return _collect(comparison.contenders, **names) | {"contacts": contacts}
 
 
-def _collect(items: Iterable[Any], **names: str) -> Row:
+def _collect(items: Sequence[Any], **names: str) -> Row:
     """Lists of attributes of the items, by key."""
-    items = list(items)
     return {key: [getattr(item, name) for item in items] for key, name in names.items()}
 
 

@@ -26,10 +26,10 @@ from ..mapping.formation_list import Stretch, format_route, list_formations, tol
 from ..problem.definition import Problem
 from ..problem.read import build_problem
 from ..verification.newton_euler import locate
+from .damage import Random, pick
 from .refusals import slow_margin
 
 Table = dict[str, Any]
-Random = np.random.Generator
 
 PLACES = 60  # places along a border at which a route looks for its ends
 
@@ -171,12 +171,12 @@ def _draw_leg(
     choice = pieces if kind == "border" else near
     if not choice:
         return None
-    piece = choice[int(rng.integers(len(choice)))]
-    track, (low, high) = piece.track, piece.places[[0, -1]]
-    place = rng.uniform(low, high)
+    piece = pick(rng, choice)
+    ends = piece.places[[0, -1]]
+    place = rng.uniform(*ends)
     if kind == "end":
-        place = [low, high][int(rng.integers(2))]
-    there = np.array(track.pose(np.array([place]))).ravel()
+        place = pick(rng, ends)
+    there = np.array(piece.track.pose(np.array([place]))).ravel()
     if kind == "beside":
         there = there + rng.normal(0.0, 0.02, 2) * size
     return np.asarray(there)
@@ -202,8 +202,7 @@ class DrawnScene:
 def draw_case(seed: int, number: int) -> DrawnScene:
     """Draw case `number` of a seed: always the same one, whichever others are drawn."""
     rng = np.random.default_rng([seed, number])
-    kinds = list(TWISTS)
-    kind = kinds[int(rng.integers(len(kinds)))]
+    kind = pick(rng, list(TWISTS))
     willing, last = rng.uniform() < 0.7, None
     for _ in range(6):
         try:
@@ -220,8 +219,7 @@ def draw_case(seed: int, number: int) -> DrawnScene:
             phases = tomllib.loads(format_route(stretches))["phases"]
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in stretches]
             moves = can_move(problem, stretches)
-            route = ROUTES[int(rng.integers(len(ROUTES)))]
-            phases, stops, name = route(rng, problem, phases, stops)
+            phases, stops, name = pick(rng, ROUTES)(rng, problem, phases, stops)
             plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
             last = DrawnScene(f"{kind}, {name}", plain, stops)
             if moves or not willing:
@@ -252,8 +250,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
 def _near_end(rng: Random, table: Table) -> Table:
     """A link that touches the object near its tip, or near its base."""
     key = str(rng.integers(1, 3))
-    finger, problem = table["fingers"][key], build_problem(table)
-    finger = dict(finger)
+    finger, problem = dict(table["fingers"][key]), build_problem(table)
     theta = float(problem.start[2 + int(key)])
     axis = np.array([math.cos(theta), math.sin(theta)])
     for name in problem.phases[0].formation.names:

@@ -381,16 +381,15 @@ def trace_pieces(
     pieces: dict[int, ReferencePiece] = {}
     touch = contact_speed * SETTINGS.touch * problem.scene.scales.speed
     for block in filter(runs_on_curves, split_blocks(problem)):
-        before: ReferencePiece | None = None
-        after: ReferencePiece | None = None
         for phase in reversed(block):
-            after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, touch, after)
+            after = pieces.get(phase.index + 1)
+            pieces[phase.index] = _trace(problem, phase, plan, size, widths, touch, after)
         for phase in block:
-            piece = pieces[phase.index]
+            piece, before = pieces[phase.index], pieces.get(phase.index - 1)
             first = float(piece.reach.high[0])
             if before is not None and before.passes:
                 first = float(before.b[-1]) * before.passes
-            before = pieces[phase.index] = piece._replace(b=piece.reach.run(first))
+            pieces[phase.index] = piece._replace(b=piece.reach.run(first))
     return pieces
 
 
