@@ -96,20 +96,14 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
     InfeasibleError if a phase has no quasistatic torques.
     """
-    speed, start = require_number(speed, "speed", positive=True), 0.0
-    times, rows = [], []
+    speed, profiles = require_number(speed, "speed", positive=True), []
     for phase in prediction.phases:
         if phase.torques is None:
             raise InfeasibleError(
                 f"no quasistatic torques to write: phase {phase.number} is not kept all along"
             )
-        times.append(start + phase.torques.s / speed)
-        rows.append(phase.torques.tau)
-        start = float(times[-1][-1])
-    t, tau = np.concatenate(times), np.vstack(rows)
-    # Where a direction reverses and where phases meet the torques step.
-    kept = np.append(True, np.diff(t) > 0) | np.append(np.diff(t) > 0, True)
-    return TorqueProfile.join_rows(t[kept], tau[kept])
+        profiles.append(TorqueProfile.join_rows(phase.torques.s / speed, phase.torques.tau))
+    return TorqueProfile.chain(profiles)
 
 
 def _predict_phase(

@@ -538,10 +538,10 @@ class Sensing:
 
     def measure(self, forces: Mapping[str, float] | None, phase: int) -> None:
         """Process a sample in a phase; contacts that are missing or NaN have no sensor."""
-        self.heard = bool(forces)
         if phase != self.phase:
             self.begin()
-            self.phase, self.heard = phase, bool(forces)
+            self.phase = phase
+        self.heard = bool(forces)
         if not forces or len(self.expected) < self.lag:
             return
         names = self.names[phase]
