@@ -18,6 +18,7 @@ Plain numbers and lists are several times as fast as arrays of this size.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -144,7 +145,7 @@ class CurveLaw:
     ) -> tuple[float, float]:
         """Torques for joint angles and speeds [N m]."""
         self._measure(theta, rates)
-        settings, s, v, j = self.settings, self.s, self.v, self.j
+        settings, s, v = self.settings, self.s, self.v
         if self.pushes:
             return self._press(theta, rates)
         if self.sensing is not None:
@@ -167,14 +168,14 @@ class CurveLaw:
         # The reference begins where the motion does.
         off = self.off
         place = s - off * max(1.0 - (s - off) / (LAW.catch * abs(off)), 0.0) if off else s
-        b = self._look(j, place)
+        b = self._look(place)
         wanted = max(sqrt(b) if b > 0.0 else 0.0, settings.touch)
         if self.after is not None:
             wanted += min(max(s - self.length, 0.0) / LAW.growth, LAW.fastest * settings.touch)
         error = wanted - v
         reach = half * max(v, settings.touch)
-        planned = (self._look(j, place + reach) - self._look(j, place - reach)) / (4.0 * reach)
-        j, share = self._locate(j, s)
+        planned = (self._look(place + reach) - self._look(place - reach)) / (4.0 * reach)
+        j, share = self._locate(s)
         # Much slower than the reference the motion does not brake with it.
         if planned < 0.0 and v < 0.5 * wanted:
             planned = 0.0
@@ -192,13 +193,13 @@ class CurveLaw:
         """Torques that press this law's contacts and bring the joints to rest [N m]."""
         self._measure(theta, rates)
         v = self.v + (self.settings.delay + 0.5 * self.settings.period) * self.a
-        j, share = self._locate(self.j, self.s)
+        j, share = self._locate(self.s)
         return self._act(j, share, v, [0.0], -self.gain * v)
 
     def slow_down(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that bring the joints to rest, without those that press contacts [N m]."""
         self._measure(theta, rates)
-        j, share = self._locate(self.j, self.s)
+        j, share = self._locate(self.s)
         (_, one, _), (_, two, _) = _evaluate(self.torque[j], share, self.v)
         return -self.gain * self.v * one, -self.gain * self.v * two
 
@@ -247,18 +248,14 @@ class CurveLaw:
         across = abs(one * f - two * e) / sqrt(self.squares[-1])
         return bool(abs(one * h - two * g) / sqrt(g * g + h * h) < across)
 
-    def _locate(self, j: int, s: float) -> tuple[int, float]:
-        """Interval of a place, searched from interval `j`, and the share of it, 0 to 1."""
-        nodes, last = self.nodes, len(self.steps) - 1
-        while j < last and s > nodes[j + 1]:
-            j += 1
-        while j > 0 and s < nodes[j]:
-            j -= 1
-        return j, min(max((s - nodes[j]) / self.steps[j], 0.0), 1.0)
+    def _locate(self, s: float) -> tuple[int, float]:
+        """Interval of a place, and the share of it, 0 to 1."""
+        j = min(max(bisect_left(self.nodes, s) - 1, 0), len(self.steps) - 1)
+        return j, min(max((s - self.nodes[j]) / self.steps[j], 0.0), 1.0)
 
-    def _look(self, j: int, s: float) -> float:
-        """The reference's b at a place near interval `j`."""
-        j, share = self._locate(j, s)
+    def _look(self, s: float) -> float:
+        """The reference's b at a place."""
+        j, share = self._locate(s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
 
     def _list_levels_across(
