@@ -477,12 +477,11 @@ class PassageTuner:
         acting one lowered, and the supporting one more so.
         """
         after = self.passage.after
-        acting, (first, second) = self.acting, (float(tau) for tau in self.last)
-        if after is not None:
-            balance = self._balance((after,), trial.z)
-            if balance is None:
-                return [None]
-            acting, (first, second) = balance[1], (float(tau) for tau in balance[0][0])
+        own = self.last[None], self.acting
+        balance = own if after is None else self._balance((after,), trial.z)
+        if balance is None:
+            return [None]
+        (first, second), acting = balance[0][0].tolist(), balance[1]
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
             for n in range(1, SETTINGS.hold)
