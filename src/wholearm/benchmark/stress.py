@@ -1,8 +1,7 @@
 """The stress study: generated scenes, changed problems and damaged files, counted by kind.
 
-Every plan is replayed and checked by Newton's and Euler's laws written out anew; every refusal is
-looked at by arguments that share nothing with the planner. `check_plan` looks at many instants of a
-plan: Newton, Euler, Coulomb, and overlaps.
+Every plan is replayed and checked at many instants by the laws of Newton, Euler and Coulomb written
+out anew, and for overlaps; every refusal by arguments that share nothing with the planner.
 """
 
 from __future__ import annotations

@@ -404,8 +404,7 @@ class MotionLaw:
 
     Attributes
     ----------
-    over, pushes  whether the next phase may begin, and whether the contact has been made
-    passed        how many of the phases have been passed
+    over, pushes, passed  as of `CurveLaw`
     """
 
     passes = False

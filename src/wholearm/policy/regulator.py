@@ -414,10 +414,9 @@ def _replan_blocks(
 
 def _pin(phase: Phase, z: Array) -> Phase:
     """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
-    until = phase.until
-    fixed = {row for row, _ in until.poses}
-    gained = until.contact is not None
-    freedoms = len(z) - len(phase.formation.contacts) - gained - len(fixed)
-    names = [name for name in ("x", "phi") if ROWS[name] not in fixed][: max(freedoms, 0)]
+    until, fixed = phase.until, dict(phase.until.coordinates)
+    closed = len(phase.formation.contacts) + (until.contact is not None)
+    freedoms = len(z) - closed - len(fixed)
+    names = [name for name in ("x", "phi") if name not in fixed][: max(freedoms, 0)]
     pins = tuple((name, float(z[ROWS[name]])) for name in names)
     return replace(phase, until=replace(until, pins=until.pins + pins))
