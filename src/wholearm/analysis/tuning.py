@@ -372,10 +372,9 @@ class PassageTuner:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
         self.end = EndDistance.to_leading(problem.scene, passage.until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
-        self.limit, scales = problem.scene.torque_limit, problem.scene.scales
-        self.slow = SETTINGS.slow * scales.speed / (scales.length if self.is_angle else 1.0)
-        self.time = scales.time
+        self.limit, self.gains = problem.scene.torque_limit, passage.until.contact is not None
+        scales, self.time = problem.scene.scales, problem.scene.scales.time
+        self.slow = SETTINGS.slow * (scales.rate if self.end.unit == "rad" else scales.speed)
         # Two freedoms where the object arrives.
         self.is_free = passage.phases[-1].formation.n_constraints < 4
         self.trials: list[TuningTrial] = []
@@ -692,7 +691,7 @@ class PassageTuner:
 
     def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
-        end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
+        end = steps[-1].time + SETTINGS.lasts * self.time
         torque = read_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
@@ -714,7 +713,7 @@ class PassageTuner:
             for name in names
         }
         worst = max(parted, key=parted.__getitem__)
-        if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
+        if parted[worst] > REST_WINDOW * self.time:
             reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
         elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
             reason = "the object does not come to rest there"

@@ -17,21 +17,20 @@ from ..common.files import read_arrays, require_ending, write_whole
 from .curve_law import CurveLaw, Law, LoopSettings, MotionLaw, Sensing
 
 FORMAT = 1  # Version of the files
-CURVE = {
-    "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
-    "keeps": (1,), "starts": (-1,),
+KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+    "curve": {
+        "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5),
+        "torque": (-1, 2, 2, 5), "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
+        "keeps": (1,), "starts": (-1,),
+    },
+    "motion": {
+        "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
+        "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2), "approach": (2,),
+    },
 }  # fmt: skip
-"""Arrays of a phase along a curve and their shapes; -1 is any."""
-MOTION = {
-    "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
-    "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
-    "approach": (2,),
-}  # fmt: skip
-"""Arrays of phases that are followed over time."""
+"""Arrays of laws along a curve and over time, and their shapes; -1 is any."""
 LATER = ("ways", "forces", "keeps", "starts", "approach")
 """Arrays that earlier versions did not write; empty ones stand for them."""
-KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 
 
 class Policy(Result):
