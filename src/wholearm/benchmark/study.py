@@ -108,9 +108,8 @@ def run_study(
     cases = list(dict.fromkeys(study.list_cases(options)))
     make_folder(options.output)
     stem = os.path.join(options.output, f"bench_{study.name}")
-    path, stamp = f"{stem}.jsonl", {"study": study.name, "version": __version__}
-    stamp |= study.stamp(options)
-    with Journal(path, stamp, options.fresh, options.again) as journal:
+    stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
+    with Journal(f"{stem}.jsonl", stamp, options.fresh, options.again) as journal:
         done = {json.dumps(row["case"]): row for row in journal.records}
         left = [case for case in cases if json.dumps(case) not in done]
         wall_start, wrong = time.monotonic(), 0
