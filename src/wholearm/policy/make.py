@@ -707,7 +707,7 @@ def make_policy(
                 # Or if torques of the next motion press too little with no speed wanted at its
                 # start. Case: new polygon 34, phase 10.
                 levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
-                keeps |= bool(find_internal_force(levels, still, still)[0][0] <= 0)
+                keeps |= not find_internal_force(levels, still, still)[0][0] > 0
             table = _tabulate_curve(piece, push, keeps)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = phase.end is End.SMOOTH
