@@ -241,10 +241,9 @@ def _describe_scenes(rows: Sequence[Row]) -> list[Table]:
 
 
 def _describe_files(rows: Sequence[Row]) -> list[Table]:
-    statuses = dict[str, list[str]]()
-    for row in sorted(rows, key=lambda row: str(row["kind"])):
-        statuses.setdefault(row["kind"], []).append(str(row["status"]))
-    table = [(kind, len(mine), _count(mine)) for kind, mine in statuses.items()]
+    kinds = sorted({row["kind"] for row in rows})
+    statuses = [[str(row["status"]) for row in rows if row["kind"] == kind] for kind in kinds]
+    table = [(kind, len(mine), _count(mine)) for kind, mine in zip(kinds, statuses, strict=True)]
     return [Table(["files", "number:d", "exit status"], table)]
 
 
