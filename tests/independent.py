@@ -144,11 +144,11 @@ def integrate_phase(
 
     `state` is (z, z') at its start, and `accuracy` relative and absolute for each step.
     """
-    contacts, own = problem.phases[index].formation.contacts, torque
+    formation, own = problem.phases[index].formation, torque
 
     def forces(t: float, y: Array) -> tuple[Array, Array]:
         tau = own.at(np.array([t]))[0]
-        return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, *directions)
+        return solve_motion(formation, y[:5], y[5:], tau, *directions)
 
     def derivative(t: float, y: Array) -> Array:
         return np.concatenate([y[5:], forces(t, y)[0]])
@@ -160,7 +160,7 @@ def integrate_phase(
         event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
         return event
 
-    events, lost = [falls(k) for k in range(len(contacts))], None
+    events, lost = [falls(k) for k in range(formation.n_contacts)], None
     inner = torque.breaks[(torque.breaks > span[0]) & (torque.breaks < span[1])]
     for start, stop in pairwise([span[0], *inner.tolist(), span[1]]):
         # A whole piece, which stays as it is to the last bit.

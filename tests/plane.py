@@ -159,7 +159,7 @@ def accelerate(
     formation: Formation, z: Array, v: Array, tau: Array, Xi: Array, sigma: Array
 ) -> tuple[Array, Array]:
     """Accelerations, shape (5,), and normal forces, shape (n_c,), of sliding contacts."""
-    return solve_motion(formation.scene, formation.contacts, z, v, tau, Xi, sigma)
+    return solve_motion(formation, z, v, tau, Xi, sigma)
 
 
 def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, Array]:

@@ -88,7 +88,7 @@ def test_records_of_other_code_do_not_count_where_that_matters(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = load_study("steps")
-    monkeypatch.setattr(study, "of_code", True, raising=False)
+    monkeypatch.setattr(study, "stamp", lambda options: {"source": digest_source()})
     command = ["bench", "steps", "-o", str(tmp_path), "--jobs", "1", "--most", "2"]
     path = tmp_path / "bench_steps.jsonl"
     main(command)
@@ -495,7 +495,7 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
         pytest.importorskip(module, reason=f"{method}: pip install 'wholearm[bench]'")
     (study, *_) = precision.PLANNERS[method].choices
     instance = phase(4, study != precision.NO_DRAG)
-    found = precision.run_planner(instance, method, TRIED[method])
+    found = precision.run_setting(instance, study, method, TRIED[method])
     error, end, violation = found["errors"]
     assert found["outcome"] == precision.SOLVED and abs(error) < 2e-2
     assert end < 1e-2 and violation < 2.6e-2

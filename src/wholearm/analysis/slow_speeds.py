@@ -33,7 +33,6 @@ from ..mechanics.dynamics import (
     inverse,
     metric_weights,
     reduced_inertia,
-    split_forces,
 )
 from ..mechanics.limits import CONE, PRESS
 from ..mechanics.path_limits import InternalForceLimits
@@ -97,20 +96,15 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
     InfeasibleError if a phase has no quasistatic torques.
     """
-    speed, start = require_number(speed, "speed", positive=True), 0.0
-    times, rows = [], []
+    speed, profiles = require_number(speed, "speed", positive=True), []
     for phase in prediction.phases:
         if phase.torques is None:
             raise InfeasibleError(
                 f"no quasistatic torques to write: phase {phase.number} is not kept all along"
             )
-        times.append(start + phase.torques.s / speed)
-        rows.append(phase.torques.tau)
-        start = float(times[-1][-1])
-    t = np.concatenate(times)
-    # Where a direction reverses and where phases meet the torques step.
-    kept = np.append(True, np.diff(t) > 0) | np.append(np.diff(t) > 0, True)
-    return TorqueProfile.join_rows(np.column_stack([t, np.vstack(rows)])[kept])
+        rows = np.column_stack([phase.torques.s / speed, phase.torques.tau])
+        profiles.append(TorqueProfile.join_rows(rows))
+    return TorqueProfile.chain(profiles)
 
 
 def _predict_phase(
@@ -182,8 +176,7 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
     # At the largest least force the span is one point, but for rounding.
     middle = np.where(low <= high, np.clip(lightest, low, high), best.internal_force)
     internal = np.where(size > 0, middle, 0.0)
-    c = forces.c(zero, zero, internal)
-    c_n, _ = split_forces(path.phase.formation, c, path.directions.Xi)
+    c_n = forces.c(zero, zero, internal)[:, : path.phase.formation.n_contacts]
     return QuasistaticTorques(path.s, path.point.z, forces.tau(zero, zero, internal), c_n)
 
 

@@ -7,7 +7,7 @@ is reached; the instant of a brake is found by false position in the arrival spe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
@@ -372,10 +372,9 @@ class PassageTuner:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
         self.end = EndDistance.to_leading(problem.scene, passage.until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.is_angle, self.gains = self.end.unit == "rad", passage.until.contact is not None
-        self.limit, scales = problem.scene.torque_limit, problem.scene.scales
-        self.slow = SETTINGS.slow * scales.speed / (scales.length if self.is_angle else 1.0)
-        self.time = scales.time
+        self.limit, self.gains = problem.scene.torque_limit, passage.until.contact is not None
+        scales, self.time = problem.scene.scales, problem.scene.scales.time
+        self.slow = SETTINGS.slow * (scales.rate if self.end.unit == "rad" else scales.speed)
         # Two freedoms where the object arrives.
         self.is_free = passage.phases[-1].formation.n_constraints < 4
         self.trials: list[TuningTrial] = []
@@ -383,13 +382,9 @@ class PassageTuner:
 
     def halve(self) -> tuple[Passage, Passage] | None:
         """Both halves of the way, the first until x or phi is what it is there."""
-        phases, paths, z = self.passage.phases, list[PathSamples](), self.z
-        for phase in phases:
-            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
-            if path is None:
-                return None
-            paths.append(path)
-            z = path.point.z[-1]
+        phases, paths = self.passage.phases, list(self._follow(self.passage.phases, self.z))
+        if len(paths) < len(phases):
+            return None
         ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
         path, left = paths[k], ends[k] - ends[-1] / 2
@@ -436,7 +431,13 @@ class PassageTuner:
         own, drives = replace(own, quasistatic=self.scale(0)), self.drive()
         drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
-            return self._sum_up(own, self.trials[-1], reason=self._explain())
+            nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
+            text = f"no constant torques reach {self.passage.until}: the nearest trial "
+            text += nearest.to_text()
+            why = "up to the torque limit"
+            if last.outcome is TrialOutcome.LOSES:
+                why = f"and raised {len(self.trials) - 1} times it {last.to_text()}"
+            return self._sum_up(own, last, reason=f"{text}, {why}")
         if not self.options.brake:
             # The fastest that is held where it arrives; the slowest arrives most gently.
             held = None
@@ -475,12 +476,11 @@ class PassageTuner:
         acting one lowered, and the supporting one more so.
         """
         after = self.passage.after
-        acting, (first, second) = self.acting, (float(tau) for tau in self.last)
-        if after is not None:
-            balance = self._balance((after,), trial.z)
-            if balance is None:
-                return [None]
-            acting, (first, second) = balance[1], (float(tau) for tau in balance[0][0])
+        own = self.last[None], self.acting
+        balance = own if after is None else self._balance((after,), trial.z)
+        if balance is None:
+            return [None]
+        (first, second), acting = balance[0][0].tolist(), balance[1]
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
             for n in range(1, SETTINGS.hold)
@@ -496,36 +496,29 @@ class PassageTuner:
 
         And the index of the torque with the most work: the finger behind the motion.
         """
-        tau: list[Array] = []
-        work: list[Array] = []
-        for phase in phases:
-            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
-            torques = None
-            if path is not None:
-                torques = find_torques(path, self.problem.epsilon, self.options.squeeze)
-            if path is None or torques is None:
+        tau, work = list[Array](), list[Array]()
+        for path in self._follow(phases, z):
+            torques = find_torques(path, self.problem.epsilon, self.options.squeeze)
+            if torques is None:
                 break
             tau.append(torques.tau)
             work.append(torques.tau * path.point.z_s[:, 3:])
+        return (np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())) if tau else None
+
+    def _follow(self, phases: Sequence[Phase], z: Array) -> Iterator[PathSamples]:
+        """Paths of phases from `z` on, up to one with other than one or two freedoms."""
+        for phase in phases:
+            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
+            if path is None:
+                return
+            yield path
             z = path.point.z[-1]
-        if not tau:
-            return None
-        return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())
 
     def _sum_up(self, own: PhaseTuning, trial: TuningTrial, **more: Any) -> PhaseTuning:
         """The tuning with the numbers of a trial, and what it took."""
         more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
         more |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
         return replace(own, simulations=self.simulations, **more)
-
-    def _explain(self) -> str:
-        """Why no torque drives the object to the end."""
-        nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
-        text = f"no constant torques reach {self.passage.until}: the nearest trial "
-        text += nearest.to_text()
-        if last.outcome is TrialOutcome.LOSES:
-            return f"{text}, and raised {len(self.trials) - 1} times it {last.to_text()}"
-        return f"{text}, up to the torque limit"
 
     @property
     def is_exhausted(self) -> bool:
@@ -698,7 +691,7 @@ class PassageTuner:
 
     def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
-        end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
+        end = steps[-1].time + SETTINGS.lasts * self.time
         torque = TorqueProfile.join_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
@@ -722,7 +715,7 @@ class PassageTuner:
             for name in names
         }
         worst = max(parted, key=parted.__getitem__)
-        if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
+        if parted[worst] > REST_WINDOW * self.time:
             reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
         elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
             reason = "the object does not come to rest there"

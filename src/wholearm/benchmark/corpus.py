@@ -47,7 +47,7 @@ from ..simulation.stepper import NODES
 from .damage import BASE, STRANGE, change_tree, damage_torques
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
-from .study import Case, Findings, Row, Study, name_case
+from .study import Case, Findings, Row, Study, digest_source, name_case
 
 FOUR = "heptagon_four_contacts"
 PROBLEMS = (
@@ -364,9 +364,8 @@ def _compare(folder: Path, name: str) -> Row:
     return _collect(comparison.contenders, **names) | {"contacts": contacts}
 
 
-def _collect(items: Iterable[Any], **names: str) -> Row:
+def _collect(items: Sequence[Any], **names: str) -> Row:
     """Lists of attributes of the items, by key."""
-    items = list(items)
     return {key: [getattr(item, name) for item in items] for key, name in names.items()}
 
 
@@ -569,7 +568,7 @@ class Corpus(Study):
     """Answers of today against stored ones."""
 
     name, title = "corpus", "Answers against stored ones"
-    of_code, folder, shipped = True, "build", True
+    folder, shipped = "build", True
     problems, rounding = Path("problems"), 0
     options = """\
 --only PATTERN ...  cases whose names match, such as 'plan heptagon *' (all)
@@ -582,8 +581,10 @@ class Corpus(Study):
 """
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
-        """How numbers are rounded."""
-        return {"kernel": os.environ.get("OPENBLAS_CORETYPE"), "rounding": options.rounding}
+        """How numbers are rounded, and source, problems and machine that records are of."""
+        source = digest_source(sorted(Path(options.problems).glob("*.toml")))
+        kernel = os.environ.get("OPENBLAS_CORETYPE")
+        return {"kernel": kernel, "rounding": options.rounding, "source": source}
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Those that are asked for."""

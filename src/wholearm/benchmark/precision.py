@@ -37,7 +37,6 @@ from scipy.integrate import solve_ivp
 from ..common.arrays import Array, Expression
 from ..common.document import Table
 from ..common.errors import InputError
-from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
@@ -55,7 +54,6 @@ from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
-from ..scene.model import Scene
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
 from .study import Case, Findings, Row, Study
@@ -134,19 +132,31 @@ class Method(NamedTuple):
     module: str = ""  # what has to be installed, if anything
 
 
-def measure(build: Callable[[], Any], judge: Callable[[Any], tuple[tuple[float, ...], str]]) -> Row:
-    """Build and run: `build` and `solve` are the times that takes [s], `judge` says the rest.
+def run_setting(instance: Instance, study: str, method: str, setting: str) -> Row:
+    """Run one setting of one method on one phase; nothing of a simulator without a course.
 
-    These are the `errors`, of a simulation of the state, relative to the scene, of a plan those of
-    the phase time, of the replayed end state, and the worst violation of a limit between nodes; and
-    the `outcome`, `SOLVED` or what failed.
+    `build` and `solve` are the times that takes [s], `errors` that of the state at the end, or of
+    the phase time and as of `check_plan`.
     """
+    subject = instance if study in PLANNING else make_course(instance, study)
+    if subject is None:
+        return {}
+    own, least = METHODS[method], find_least_time(instance) if study in PLANNING else math.nan
+    if own.module:
+        # No timing is to include the import.
+        __import__(own.module)
     with warnings.catch_warnings():
         # Warnings of peers are not ours.
         warnings.simplefilter("ignore")
-        built, run = _time(build)
+        built, run = _time(partial(own.build, subject, setting))
         took, answer = _time(run)
-    errors, outcome = judge(answer)
+    if isinstance(subject, Course):
+        errors = [measure_error(subject.problem, answer, subject.end)]
+        outcome = SOLVED if np.isfinite(errors[0]) else "no finite state"
+    else:
+        *checked, outcome = check_plan(instance, answer)
+        late = math.nan if isinstance(answer, str) else answer.duration / least - 1
+        errors = [late, *checked]
     return {"build": built, "solve": took, "errors": errors, "outcome": outcome}
 
 
@@ -168,22 +178,16 @@ def find_mean(seconds: Sequence[float]) -> float:
 
 
 def solve_motion(
-    scene: Scene,
-    contacts: Sequence[Contact],
-    z: Array,
-    z_dot: Array,
-    tau: Array,
-    Xi: Array,
-    sigma: Array,
+    formation: Formation, z: Array, z_dot: Array, tau: Array, Xi: Array, sigma: Array
 ) -> tuple[Array, Array]:
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
     the contact conditions differentiated twice: rates of their rows by complex steps.
     """
-    tiny = 1e-30  # [s]
+    tiny, scene = 1e-30, formation.scene  # [s]
     ahead = (z + 1j * tiny * z_dot)[None]
-    touches = [locate(scene, contact.name, ahead) for contact in contacts]
+    touches = [locate(scene, name, ahead) for name in formation.names]
     rows = np.array([touch.normal[0] for touch in touches])
     slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
     friction = scene.viscous * z_dot + scene.dry * np.append(np.zeros(3), sigma)
@@ -221,7 +225,7 @@ def integrate(
     piece column by column, its ends, and those of the stretch. Contacts stay closed: those that are
     lost pull.
     """
-    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments]
+    parts = [*curve.segments]
     y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
         profile = torque.cut(t, stop)
@@ -233,7 +237,7 @@ def integrate(
                 t: float, y: Array, part: Segment = part, own: TorqueProfile = profile
             ) -> tuple[Array, Array]:
                 tau = own.at(np.array([t]))[0]
-                return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+                return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
 
             def rates(t: float, y: Array, solve: Any = solve) -> Array:
                 return np.concatenate([y[5:], solve(t, y)[0]])
@@ -320,19 +324,6 @@ SIMULATORS = {
 }
 
 
-def run_simulator(instance: Instance, study: str, method: str, setting: str) -> Row:
-    """Run one setting of one simulator on one phase; nothing if the phase has no course."""
-    course = make_course(instance, study)
-    if course is None:
-        return {}
-
-    def judge(state: Array) -> tuple[tuple[float, ...], str]:
-        error = measure_error(course.problem, state, course.end)
-        return (error,), SOLVED if np.isfinite(error) else "no finite state"
-
-    return measure(partial(SIMULATORS[method].build, course, setting), judge)
-
-
 @lru_cache(maxsize=64)
 def make_course(instance: Instance, study: str) -> Course | None:
     """The course of a phase: of 95 % of its last stretch, as just before a stop all is ill-posed.
@@ -358,13 +349,9 @@ def make_course(instance: Instance, study: str) -> Course | None:
 
 
 def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
-    """Replay a plan.
+    """Error of the replayed end state, worst violation, and `SOLVED` or why the plan is none.
 
-    Returns
-    -------
-    end        error of the end state, relative to the scene
-    violation  worst of c_n >= epsilon, over the scene's force, or of a torque limit, over it
-    outcome    `SOLVED`, or why the plan is none
+    The violation is of c_n >= epsilon, over the scene's force, or of a torque limit, over it.
     """
     if isinstance(plan, str):
         return math.nan, math.nan, plan
@@ -397,21 +384,6 @@ def build_plant(formation: Formation) -> Expression:
     acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
     missed = P @ acceleration + P_dot_v
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
-
-
-def run_planner(instance: Instance, method: str, setting: str) -> Row:
-    """Run one setting of one planner on one phase, and check its plans."""
-    if module := PLANNERS[method].module:
-        # No timing is to include the import.
-        __import__(module)
-    least = find_least_time(instance)
-
-    def judge(plan: Plan) -> tuple[tuple[float, ...], str]:
-        end, violation, outcome = check_plan(instance, plan)
-        error = math.nan if isinstance(plan, str) else plan.duration / least - 1
-        return (error, end, violation), outcome
-
-    return measure(partial(PLANNERS[method].build, instance, setting), judge)
 
 
 @lru_cache(maxsize=64)
@@ -783,10 +755,7 @@ class Precision(Study):
         study, name, method, setting, files = case
         instances = list_instances(files, study != NO_DRAG)
         instance = next(instance for instance in instances if instance.name == name)
-        if study in PLANNING:
-            measured = run_planner(instance, method, setting)
-        else:
-            measured = run_simulator(instance, study, method, setting)
+        measured = run_setting(instance, study, method, setting)
         return dict(zip(self.columns[:4], case, strict=False)) | measured
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:

@@ -183,14 +183,12 @@ def draw_query(seed: int, number: int, folder: Path) -> Problem:
     """The problem of a query: a shipped scene, or one of five random polygons in a shipped hand."""
     kind = number % (len(SHIPPED) + 5)
     name = SHIPPED[kind] if kind < len(SHIPPED) else "hexagon"
-    table = dict(read_problem(str(folder / f"{name}.toml")).table)
+    table = {**read_problem(str(folder / f"{name}.toml")).table, "name": name}
     table.pop("phases")
     if kind >= len(SHIPPED):
         rng = np.random.default_rng([seed, 1000 + kind])
         table["object"] = {"vertices": _draw_corners(rng, int(rng.integers(3, 8))), "mass": 0.2}
         table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
-    else:
-        table["name"] = name
     return _draw_goal(np.random.default_rng([seed, number]), table)
 
 

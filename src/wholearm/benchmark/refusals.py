@@ -26,6 +26,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -68,13 +69,13 @@ def follow(phase: Phase, z: Array) -> tuple[Trace, Trace]:
         return gaps[0], rows[0, : gaps.shape[1]]
 
     # The phase before ends where bodies overlap by `OVERLAP`.
-    closed = project(phase.formation.scene, z, equations)
+    closed = project(phase.formation.scene, equations, z)
     z = z if closed is None else closed
     return _march(phase, z, 1.0), _march(phase, z, -1.0)
 
 
 def project(
-    scene: Scene, z: Array, equations: Callable[[Array], tuple[Array, Array]]
+    scene: Scene, equations: Callable[[Array], tuple[Array, Array]], z: Array
 ) -> Array | None:
     """Nearest zero of equations to `z`, by Newton's method; None if none.
 
@@ -146,12 +147,9 @@ def find_room(formation: Formation, z: Array) -> dict[str, Array]:
 
 
 def resample(formation: Formation, trace: Trace, count: int) -> tuple[Array, Array, Array]:
-    """The curve at even places, and also where a contact or a joint turns.
+    """Arc lengths s, (n,) [m], z and unit tangents z_s, (n, 5), at even places of a curve.
 
-    Returns
-    -------
-    s : (n,) [m]     arc length
-    z, z_s : (n, 5)  configurations, and unit tangents along the way
+    And also where a contact or a joint turns.
     """
 
     def slide(s: Array) -> Array:
@@ -492,10 +490,7 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
 def list_ends(phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
     scene, formation = phase.formation.scene, phase.formation
-
-    def project_end(z: Array) -> Array | None:
-        return project(scene, z, lambda z: _end_equations(phase, z))
-
+    project_end = partial(project, scene, partial(_end_equations, phase))
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
     first = project_end(bend(formation, z, line[None])[0, -1])

@@ -12,7 +12,7 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,10 @@ from ..mapping.formation_list import Stretch, format_route, list_formations, tol
 from ..problem.definition import Problem
 from ..problem.read import build_problem
 from ..verification.newton_euler import locate
+from .damage import Random, pick
 from .refusals import slow_margin
 
 Table = dict[str, Any]
-Random = np.random.Generator
 
 PLACES = 60  # places along a border at which a route looks for its ends
 
@@ -171,12 +171,12 @@ def _draw_leg(
     choice = pieces if kind == "border" else near
     if not choice:
         return None
-    piece = choice[int(rng.integers(len(choice)))]
-    track, (low, high) = piece.track, piece.places[[0, -1]]
-    place = rng.uniform(low, high)
+    piece = pick(rng, choice)
+    ends = piece.places[[0, -1]]
+    place = rng.uniform(*ends)
     if kind == "end":
-        place = [low, high][int(rng.integers(2))]
-    there = np.array(track.pose(np.array([place]))).ravel()
+        place = pick(rng, ends)
+    there = np.array(piece.track.pose(np.array([place]))).ravel()
     if kind == "beside":
         there = there + rng.normal(0.0, 0.02, 2) * size
     return np.asarray(there)
@@ -202,8 +202,7 @@ class DrawnScene:
 def draw_case(seed: int, number: int) -> DrawnScene:
     """Draw case `number` of a seed: always the same one, whichever others are drawn."""
     rng = np.random.default_rng([seed, number])
-    kinds = list(TWISTS)
-    kind = kinds[int(rng.integers(len(kinds)))]
+    kind = pick(rng, list(TWISTS))
     willing, last = rng.uniform() < 0.7, None
     for _ in range(6):
         try:
@@ -220,8 +219,7 @@ def draw_case(seed: int, number: int) -> DrawnScene:
             phases = tomllib.loads(format_route(stretches))["phases"]
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in stretches]
             moves = can_move(problem, stretches)
-            route = ROUTES[int(rng.integers(len(ROUTES)))]
-            phases, stops, name = route(rng, problem, phases, stops)
+            phases, stops, name = pick(rng, ROUTES)(rng, problem, phases, stops)
             plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
             last = DrawnScene(f"{kind}, {name}", plain, stops)
             if moves or not willing:
@@ -252,8 +250,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
 def _near_end(rng: Random, table: Table) -> Table:
     """A link that touches the object near its tip, or near its base."""
     key = str(rng.integers(1, 3))
-    finger, problem = table["fingers"][key], build_problem(table)
-    finger = dict(finger)
+    finger, problem = dict(table["fingers"][key]), build_problem(table)
     theta = float(problem.start[2 + int(key)])
     axis = np.array([math.cos(theta), math.sin(theta)])
     for name in problem.phases[0].formation.names:
@@ -317,28 +314,16 @@ def _at_rest(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Rou
     return phases, stops, "from the map"
 
 
-def _struck(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
-    """Impacts wherever a contact is gained that the next phase has."""
-    changed = [
-        dict(phase, end="impact")
-        if isinstance(phase["until"], str)
-        and phase["until"] in following["contacts"]
-        and set(following["contacts"]) <= {*phase["contacts"], phase["until"]}
-        else phase
-        for phase, following in itertools.pairwise(phases)
-    ]
-    return [*changed, phases[-1]], stops, "impacts"
-
-
-def _joined(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
-    """Smooth ends wherever a phase passes into one with three contacts or fewer freedoms."""
+def _joined(rng: Random, problem: Problem, phases: Phases, stops: Stops, end: str) -> Route:
+    """Impacts wherever the next phase has the gained contact, or smooth ends where it has less."""
     changed = []
     for phase, following in itertools.pairwise(phases):
         gained = {phase["until"]} if isinstance(phase["until"], str) else set()
-        fits = set(following["contacts"]) <= {*phase["contacts"], *gained}
-        less = len(following["contacts"]) < len(phase["contacts"]) + len(gained)
-        changed.append(dict(phase, end="smooth") if fits and less and len(phases) < 5 else phase)
-    return [*changed, phases[-1]], stops, "smooth"
+        before, after = {*phase["contacts"], *gained}, set(following["contacts"])
+        less = len(after) < len(phase["contacts"]) + len(gained) and len(phases) < 5
+        fits = bool(gained) and gained <= after if end == "impact" else less
+        changed.append(dict(phase, end=end) if fits and after <= before else phase)
+    return [*changed, phases[-1]], stops, "impacts" if end == "impact" else end
 
 
 def _split(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
@@ -374,5 +359,6 @@ def _rolled(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Rout
     return [slide, rolling], [], "rolling"
 
 
-ROUTES = (_at_rest, _at_rest, _struck, _joined, _split, _rolled)
+_struck, _smoothed = (partial(_joined, end=end) for end in ("impact", "smooth"))
+ROUTES = (_at_rest, _at_rest, _struck, _smoothed, _split, _rolled)
 """Problems that are made of a list from the map."""

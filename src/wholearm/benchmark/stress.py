@@ -1,8 +1,7 @@
 """The stress study: generated scenes, changed problems and damaged files, counted by kind.
 
-Every plan is replayed and checked by Newton's and Euler's laws written out anew; every refusal is
-looked at by arguments that share nothing with the planner. `check_plan` looks at many instants of a
-plan: Newton, Euler, Coulomb, and overlaps.
+Every plan is replayed and checked at many instants by the laws of Newton, Euler and Coulomb written
+out anew, and for overlaps; every refusal by arguments that share nothing with the planner.
 """
 
 from __future__ import annotations
@@ -242,10 +241,9 @@ def _describe_scenes(rows: Sequence[Row]) -> list[Table]:
 
 
 def _describe_files(rows: Sequence[Row]) -> list[Table]:
-    statuses = dict[str, list[str]]()
-    for row in sorted(rows, key=lambda row: str(row["kind"])):
-        statuses.setdefault(row["kind"], []).append(str(row["status"]))
-    table = [(kind, len(mine), _count(mine)) for kind, mine in statuses.items()]
+    kinds = sorted({row["kind"] for row in rows})
+    statuses = [[str(row["status"]) for row in rows if row["kind"] == kind] for kind in kinds]
+    table = [(kind, len(mine), _count(mine)) for kind, mine in zip(kinds, statuses, strict=True)]
     return [Table(["files", "number:d", "exit status"], table)]
 
 

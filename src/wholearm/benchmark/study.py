@@ -49,7 +49,6 @@ class Study:
 
     name = title = ""  # of its files, ``bench_NAME.jsonl``, ``.md`` and ``.csv``; of the table
     folder = "results"  # where, if the command line does not say
-    of_code = False  # whether records count only for the source, problems and machine they are of
     timed = alone = False  # whether cases are run one at a time, and each in a process of its own
     strict = False  # whether warnings are errors
     shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
@@ -109,12 +108,8 @@ def run_study(
     cases = list(dict.fromkeys(study.list_cases(options)))
     make_folder(options.output)
     stem = os.path.join(options.output, f"bench_{study.name}")
-    path, stamp = f"{stem}.jsonl", {"study": study.name, "version": __version__}
-    stamp |= study.stamp(options)
-    if study.of_code:
-        files = Path(options.problems).glob("*.toml") if study.shipped else ()
-        stamp["source"] = digest_source(sorted(files))
-    with Journal(path, stamp, options.fresh, options.again) as journal:
+    stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
+    with Journal(f"{stem}.jsonl", stamp, options.fresh, options.again) as journal:
         done = {json.dumps(row["case"]): row for row in journal.records}
         left = [case for case in cases if json.dumps(case) not in done]
         wall_start, wrong = time.monotonic(), 0

@@ -115,8 +115,7 @@ class EngineReport(Result):
     @property
     def document(self) -> Document:
         """Errors and forces of each stretch."""
-        scales, departures = self.problem.scene.scales, self.levels[0].departures
-        setting = self.levels[0].setting
+        scales, (setting, departures) = self.problem.scene.scales, self.levels[0]
         millimetres, degrees = self.allowed * scales.length * 1e3, math.degrees(self.allowed)
         worst = max(float(np.max(each.position)) for each in departures) * 1e3
         turned = math.degrees(max(float(np.max(each.angle)) for each in departures))

@@ -204,14 +204,13 @@ def list_stretches(plan: Trajectory, begins: Sequence[int]) -> list[EngineStretc
     """Parts of a plan, from its planned start at each of the phases `begins` to the next one."""
     starts, stretches = plan.phase_starts, []
     for first, after in pairwise([*begins, len(plan.motions)]):
-        phases = tuple(range(first, after))
-        motion, start, stop = plan.motions[phases[0]], starts[phases[0]], starts[phases[-1] + 1]
+        motion, start, stop = plan.motions[first], starts[first], starts[after]
         at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
         # Forces of a replay that waits at rest are NaN.
         c_n = np.nan_to_num(at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))])
         forces = dict(zip(motion.contacts, c_n.tolist(), strict=True))
-        state = at.z[0], at.z_dot[0], at.z_ddot[0]
-        stretches.append(EngineStretch(phases, float(start), float(stop), *state, forces))
+        span = tuple(range(first, after)), float(start), float(stop)
+        stretches.append(EngineStretch(*span, at.z[0], at.z_dot[0], at.z_ddot[0], forces))
     return stretches
 
 

@@ -209,10 +209,7 @@ def add(parent: Element, tag: str, **attributes: object) -> Element:
 def play(
     problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
 ) -> engine.EngineRun:
-    """Replay a stretch in MuJoCo; an `Engine`.
-
-    ImportError if MuJoCo is not installed.
-    """
+    """Replay a stretch in MuJoCo; an `Engine`."""
     import mujoco
 
     steps = engine.list_steps(problem, stretch, torque, setting.step)
@@ -246,10 +243,9 @@ def play(
         return total / (end - start)
 
     # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
-    nowhere = dict.fromkeys(stretch.c_n, np.inf)
     little = 1e-6 * problem.scene.scales.length
     touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
-    data.qpos[:] = engine.press_in(problem, stretch, {**nowhere, **touching})
+    data.qpos[:] = engine.press_in(problem, stretch, touching)
     mujoco.mj_forward(model, data)
     stiffnesses = np.zeros(len(pairs))
     collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])

@@ -18,9 +18,11 @@ Plain numbers and lists are several times as fast as arrays of this size.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import ceil, inf, isfinite, sqrt
 from typing import Any, NamedTuple
 
@@ -95,30 +97,28 @@ class CurveLaw:
     """
 
     def __init__(
-        self,
-        tables: Mapping[str, Any],
-        settings: LoopSettings,
-        following: CurveLaw | MotionLaw | None = None,
+        self, tables: Mapping[str, Any], settings: LoopSettings, following: Law | None = None
     ) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
-        self.starts = list(tables.get("starts", ())) or [0.0]
+        self.starts = tables["starts"].tolist() or [0.0]
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
-        self.keeps = bool(tables.get("keeps", [0.0])[0])
-        pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
-        self.steps = [after - before for before, after in pairs]
+        self.keeps = bool(tables["keeps"][0])
+        self.steps = [after - before for before, after in pairwise(self.nodes)]
         self.borders = [self.nodes.index(start) for start in self.starts[1:]]
-        self.chords = [
-            (after[0] - before[0], after[1] - before[1])
-            for before, after in zip(self.theta, self.theta[1:], strict=False)
-        ]
+        self.chords = [(c - a, d - b) for (a, b), (c, d) in pairwise(self.theta)]
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
         # Speeds by chords would step at nodes where joint angles bend. Case: hexagon, phase 5.
         self.slopes = np.gradient(tables["theta"], tables["s"], axis=0).tolist()
         self.levels, self.torque = _split(tables["levels"], most=1e6), _split(tables["torque"])
-        self.floor = self._find_floor()
+        # Level on each interval below which feedback is reduced.
+        self.floor = list[float]()
+        for j, (h, ends) in enumerate(zip(self.steps, pairwise(self.b), strict=True)):
+            rows = [_evaluate(self.levels[j], k, sqrt(b)) for k, b in enumerate(ends)]
+            level = min(_choose_at(each, (ends[1] - ends[0]) / (2 * h))[0] for each in rows)
+            self.floor.append(min(LAW.level, LAW.part * level))
         self.gain = LAW.gain / (settings.period + settings.delay)
         self.memory = LAW.integral * self.gain**2 * settings.period
         self.beyond = LAW.beyond * settings.touch
@@ -145,7 +145,7 @@ class CurveLaw:
     ) -> tuple[float, float]:
         """Torques for joint angles and speeds [N m]."""
         self._measure(theta, rates)
-        settings, s, v, j = self.settings, self.s, self.v, self.j
+        settings, s, v = self.settings, self.s, self.v
         if self.pushes:
             return self._press(theta, rates)
         if self.sensing is not None:
@@ -168,14 +168,14 @@ class CurveLaw:
         # The reference begins where the motion does.
         off = self.off
         place = s - off * max(1.0 - (s - off) / (LAW.catch * abs(off)), 0.0) if off else s
-        b = self._look(j, place)
+        b = self._look(place)
         wanted = max(sqrt(b) if b > 0.0 else 0.0, settings.touch)
         if self.after is not None:
             wanted += min(max(s - self.length, 0.0) / LAW.growth, LAW.fastest * settings.touch)
         error = wanted - v
         reach = half * max(v, settings.touch)
-        planned = (self._look(j, place + reach) - self._look(j, place - reach)) / (4.0 * reach)
-        j, share = self._locate(j, s)
+        planned = (self._look(place + reach) - self._look(place - reach)) / (4.0 * reach)
+        j, share = self._locate(s)
         # Much slower than the reference the motion does not brake with it.
         if planned < 0.0 and v < 0.5 * wanted:
             planned = 0.0
@@ -193,13 +193,13 @@ class CurveLaw:
         """Torques that press this law's contacts and bring the joints to rest [N m]."""
         self._measure(theta, rates)
         v = self.v + (self.settings.delay + 0.5 * self.settings.period) * self.a
-        j, share = self._locate(self.j, self.s)
+        j, share = self._locate(self.s)
         return self._act(j, share, v, [0.0], -self.gain * v)
 
     def slow_down(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that bring the joints to rest, without those that press contacts [N m]."""
         self._measure(theta, rates)
-        j, share = self._locate(self.j, self.s)
+        j, share = self._locate(self.s)
         (_, one, _), (_, two, _) = _evaluate(self.torque[j], share, self.v)
         return -self.gain * self.v * one, -self.gain * self.v * two
 
@@ -248,30 +248,15 @@ class CurveLaw:
         across = abs(one * f - two * e) / sqrt(self.squares[-1])
         return bool(abs(one * h - two * g) / sqrt(g * g + h * h) < across)
 
-    def _locate(self, j: int, s: float) -> tuple[int, float]:
-        """Interval of a place, searched from interval `j`, and the share of it, 0 to 1."""
-        nodes, last = self.nodes, len(self.steps) - 1
-        while j < last and s > nodes[j + 1]:
-            j += 1
-        while j > 0 and s < nodes[j]:
-            j -= 1
-        return j, min(max((s - nodes[j]) / self.steps[j], 0.0), 1.0)
+    def _locate(self, s: float) -> tuple[int, float]:
+        """Interval of a place, and the share of it, 0 to 1."""
+        j = min(max(bisect_left(self.nodes, s) - 1, 0), len(self.steps) - 1)
+        return j, min(max((s - self.nodes[j]) / self.steps[j], 0.0), 1.0)
 
-    def _look(self, j: int, s: float) -> float:
-        """The reference's b at a place near interval `j`."""
-        j, share = self._locate(j, s)
+    def _look(self, s: float) -> float:
+        """The reference's b at a place."""
+        j, share = self._locate(s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
-
-    def _find_floor(self) -> list[float]:
-        """Level on each interval below which feedback is reduced."""
-        floors = []
-        for j, h in enumerate(self.steps):
-            ends = self.b[j : j + 2]
-            a = (ends[1] - ends[0]) / (2 * h)
-            rows = [_evaluate(self.levels[j], k, sqrt(b)) for k, b in enumerate(ends)]
-            level = min(_choose_at(each, a)[0] for each in rows)
-            floors.append(min(LAW.level, LAW.part * level))
-        return floors
 
     def _list_levels_across(
         self, torques: Sequence[Row], j: int, share: float, v: float
@@ -419,17 +404,13 @@ class MotionLaw:
 
     Attributes
     ----------
-    over, pushes  whether the next phase may begin, and whether the contact has been made
-    passed        how many of the phases have been passed
+    over, pushes, passed  as of `CurveLaw`
     """
 
     passes = False
 
     def __init__(
-        self,
-        tables: Mapping[str, Any],
-        settings: LoopSettings,
-        following: CurveLaw | MotionLaw | None = None,
+        self, tables: Mapping[str, Any], settings: LoopSettings, following: Law | None = None
     ) -> None:
         self.settings, self.starts = settings, tables["starts"].tolist()
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
@@ -523,6 +504,9 @@ class MotionLaw:
         return k, min(place - k, 1.0)
 
 
+Law = CurveLaw | MotionLaw
+
+
 class Sensing:
     """Filtered errors of the predicted contact forces of a phase.
 
@@ -550,10 +534,10 @@ class Sensing:
 
     def measure(self, forces: Mapping[str, float] | None, phase: int) -> None:
         """Process a sample in a phase; contacts that are missing or NaN have no sensor."""
-        self.heard = bool(forces)
         if phase != self.phase:
             self.begin()
-            self.phase, self.heard = phase, bool(forces)
+            self.phase = phase
+        self.heard = bool(forces)
         if not forces or len(self.expected) < self.lag:
             return
         names = self.names[phase]

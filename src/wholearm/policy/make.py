@@ -183,30 +183,23 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
         error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
         unit.append(SETTINGS.least * contact.side_scales + error)
-    slack[1][have_same_signs(*sides)] = UNLIMITED
+    before, after = map(np.hstack, sides)
+    slack[1][(before == after).all(axis=1)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
     unit.append(np.tile(SETTINGS.spare * joint.side_scales, (len(s), 1)))
     table, units = (np.concatenate(parts, axis=1) for parts in (slack, unit))
     return CurveLimitRows(s, torque, table, units, 2 * slack[0].shape[1])
 
 
-def have_same_signs(before: Directions, after: Directions) -> Array:
-    """Where directions before and after the nearest reversal are equal, shape (n,)."""
-    same = [(one == other).all(axis=1) for one, other in zip(before, after, strict=True)]
-    return np.asarray(same[0] & same[1])
-
-
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
     """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
-    first = curve.segments[0]
-    pairs = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
-    for before, after in pairwise(curve.segments):
+    signs = [np.append(part.Xi, part.sigma) for part in curve.segments]
+    blended = np.tile(signs[0], (3, len(s), 1))
+    for before, (one, other) in zip(curve.segments, pairwise(signs), strict=False):
         near = max(float(np.interp(before.stop, s, width)), 1e-3 * curve.length)
         share = np.clip(0.5 + (s - before.stop) / (2 * near), 0.0, 1.0)[:, None]
-        for directions, part in zip(pairs, (share, np.floor(share), np.ceil(share)), strict=True):
-            directions[0] += part * (after.Xi - before.Xi)
-            directions[1] += part * (after.sigma - before.sigma)
-    return [Directions(*directions) for directions in pairs]
+        blended += np.stack([share, np.floor(share), np.ceil(share)]) * (other - one)
+    return [Directions(*np.split(each, [-2], axis=1)) for each in blended]
 
 
 class Corners(NamedTuple):
@@ -336,7 +329,8 @@ def find_within(
     left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
     forces = np.maximum(SETTINGS.least * contact.side_scales, least)
     unit = np.concatenate([forces, SETTINGS.spare * joint.side_scales])
-    same = have_same_signs(*sides)
+    one, other = map(np.hstack, sides)
+    same = (one == other).all(axis=1)
     return Within(s, nominal, left, (corners[0], corners[1]), same, unit)
 
 
@@ -350,19 +344,6 @@ class ReferencePiece(NamedTuple):
     begins: float  # [m^2/s^2]: the plan's b at the start
     passes: float  # ratio of b after and before the end, passed in motion; zero at rest
     b: Array  # (n,) [m^2/s^2]: the reference
-
-    @property
-    def duration(self) -> float:
-        """Duration of the reference [s]."""
-        return float(find_duration(self.b, np.diff(self.rows.s)))
-
-    @property
-    def presses_at_rest(self) -> bool:
-        """Whether torques of its motion press all contacts with no speed wanted at the start.
-
-        Case without: new polygon 34, phase 10.
-        """
-        return float(find_internal_force(self.rows.levels[:1], np.zeros(1), np.zeros(1))[0][0]) > 0
 
     @property
     def reserves(self) -> dict[str, float]:
@@ -400,16 +381,15 @@ def trace_pieces(
     pieces: dict[int, ReferencePiece] = {}
     touch = contact_speed * SETTINGS.touch * problem.scene.scales.speed
     for block in filter(runs_on_curves, split_blocks(problem)):
-        before: ReferencePiece | None = None
-        after: ReferencePiece | None = None
         for phase in reversed(block):
-            after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, touch, after)
+            after = pieces.get(phase.index + 1)
+            pieces[phase.index] = _trace(problem, phase, plan, size, widths, touch, after)
         for phase in block:
-            piece = pieces[phase.index]
+            piece, before = pieces[phase.index], pieces.get(phase.index - 1)
             first = float(piece.reach.high[0])
             if before is not None and before.passes:
                 first = float(before.b[-1]) * before.passes
-            before = pieces[phase.index] = piece._replace(b=piece.reach.run(first))
+            pieces[phase.index] = piece._replace(b=piece.reach.run(first))
     return pieces
 
 
@@ -518,9 +498,10 @@ def retime_within(
     least: float,
     end: tuple[float, float] | None = None,
 ) -> tuple[tuple[CurveLimitRows, ControllableSet] | None, float]:
-    """The fastest motion that keeps its limits within the largest feasible share of ranges.
+    """The law's limits and the fastest motions that keep them within a share of ranges; the share.
 
-    Fixed-point iteration between the worst corners of the ranges and the motion.
+    It is the largest feasible one. Fixed-point iteration between the worst corners of the ranges
+    and the motion.
 
     Parameters
     ----------
@@ -529,10 +510,6 @@ def retime_within(
     widths        half widths of the ranges; that of the delay is its unknown part
     least : [N]   least normal force within them
     end           as of `retime`
-
-    Returns
-    -------
-    tuple  the law's limits and the motions, None if there are none; and the share of the ranges
     """
 
     def find(share: float) -> tuple[CurveLimitRows, ControllableSet] | None:
@@ -612,18 +589,15 @@ def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str
 
 def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array]:
     """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
-    length = one["s"][-1]
-    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("theta", "b")}
-    joined["s"] = np.concatenate([one["s"], length + two["s"][1:]])
-    joined["starts"] = np.concatenate([one["starts"], length + two["starts"]])
-    for name in ("torque", "forces"):
+    two = {**two, **{name: one["s"][-1] + two[name] for name in ("s", "starts")}}
+    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("s", "theta", "b")}
+    for name in ("starts", "torque", "forces"):
         joined[name] = np.concatenate([one[name], two[name]])
     parts = one["levels"], two["levels"]
-    levels = np.tile(UNLIMITED, (len(joined["s"]) - 1, 2, max(p.shape[2] for p in parts), 1))
-    for part, span in zip(parts, (slice(len(parts[0])), slice(len(parts[0]), None)), strict=True):
-        levels[span, :, : part.shape[2]] = part
-    joined["levels"] = levels
-    return {**two, **joined}
+    most = max(part.shape[2] for part in parts)
+    missing = [np.tile(UNLIMITED, (len(p), 2, most - p.shape[2], 1)) for p in parts]
+    wide = [np.concatenate(pair, axis=2) for pair in zip(parts, missing, strict=True)]
+    return {**two, **joined, "levels": np.concatenate(wide)}
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -710,20 +684,18 @@ def make_policy(
     pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block in blocks:
-        lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
-        entries: list[dict[str, Any]] = [
-            {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
-        ]
+        for phase in block:
+            lasts = float(np.diff(starts)[phase.index])
+            about.append({"number": phase.number, "plan": lasts, "duration": lasts, "share": 0.0})
         if block[0].index not in pieces:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
-            for one, span in zip(entries, np.diff(ends).tolist(), strict=True):
-                one["duration"] = span
-            entries[-1]["duration"] += settings.dwell + delay
-            about += entries
+            for entry, span in zip(about[-len(block) :], np.diff(ends).tolist(), strict=True):
+                entry["duration"] = span
+            about[-1]["duration"] += settings.dwell + delay
             continue
         goes_on = False
-        for phase, entry in zip(block, entries, strict=True):
+        for phase, entry in zip(block, about[-len(block) :], strict=True):
             piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
             push, hold = plan.tau[last], None
             if not np.isnan(plan.c_n[last]).all():
@@ -731,19 +703,22 @@ def make_policy(
                 push = push if hold is None else hold
             # Friction of the joints decides on rest where torques are not much larger.
             keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
-            after = pieces.get(phase.index + 1)
-            keeps |= hold is not None and after is not None and not after.presses_at_rest
+            if hold is not None and phase.index + 1 in pieces:
+                # Or if torques of the next motion press too little with no speed wanted at its
+                # start. Case: new polygon 34, phase 10.
+                levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
+                keeps |= not find_internal_force(levels, still, still)[0][0] > 0
             table = _tabulate_curve(piece, push, keeps)
             tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = phase.end is End.SMOOTH
-            entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
+            entry.update(duration=lasts, share=piece.share, reserves=piece.reserves)
             # The plan goes on in motion there.
             planned_end = phases[phase.index].end
             entry["stops"] = phase.end is End.REST and planned_end is not End.REST
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
             if not piece.passes:
                 entry["duration"] += settings.dwell + delay
-        about += entries
     duration = sum(phase["duration"] for phase in about)
     whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:

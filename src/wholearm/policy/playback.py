@@ -14,25 +14,23 @@ from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, require_number
 from ..common.files import read_arrays, require_ending, write_whole
-from .curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing
+from .curve_law import CurveLaw, Law, LoopSettings, MotionLaw, Sensing
 
 FORMAT = 1  # Version of the files
-CURVE = {
-    "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
-    "keeps": (1,), "starts": (-1,),
+KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+    "curve": {
+        "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5),
+        "torque": (-1, 2, 2, 5), "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
+        "keeps": (1,), "starts": (-1,),
+    },
+    "motion": {
+        "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
+        "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2), "approach": (2,),
+    },
 }  # fmt: skip
-"""Arrays of a phase along a curve and their shapes; -1 is any."""
-MOTION = {
-    "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
-    "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
-    "approach": (2,),
-}  # fmt: skip
-"""Arrays of phases that are followed over time."""
+"""Arrays of laws along a curve and over time, and their shapes; -1 is any."""
 LATER = ("ways", "forces", "keeps", "starts", "approach")
 """Arrays that earlier versions did not write; empty ones stand for them."""
-KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
-Law = CurveLaw | MotionLaw
 
 
 class Policy(Result):
@@ -87,10 +85,10 @@ class Policy(Result):
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
             entries = phases[first - 1 : first - 1 + len(law.starts)]
             names = [list(entry.get("reserves", {})) for entry in entries]
-            table = arrays.get("forces", np.zeros((0, 2, 0, 5)))
-            if isinstance(law, CurveLaw) and {len(each) for each in names} == {table.shape[2]}:
+            known = {len(each) for each in names}
+            if isinstance(law, CurveLaw) and known == {arrays["forces"].shape[2]}:
                 late, gained = self.settings.delay / self.settings.period, entries[-1]["gained"]
-                law.sensing = Sensing(names, gained, table, late)
+                law.sensing = Sensing(names, gained, arrays["forces"], late)
                 contacts.update(dict.fromkeys(chain(*names, [gained] if gained else [])))
         self.contacts = list(contacts)
         self.reset()
@@ -270,13 +268,10 @@ def _read_tables(
     """Checked tables of a law."""
     tables = {}
     for name, shape in shapes.items():
-        key = f"{name}_{number}"
-        if key not in arrays and name in LATER:
-            tables[name] = np.zeros([max(n, 0) for n in shape])
-            continue
-        if key not in arrays:
+        key, none = f"{name}_{number}", np.zeros([max(n, 0) for n in shape])
+        array = arrays.get(key, none if name in LATER else None)
+        if array is None:
             raise InputError(source, key, "array is missing")
-        array = arrays[key]
         fits = array.dtype.kind == "f" and array.ndim == len(shape) and np.isfinite(array).all()
         if not fits or any(w not in (-1, n) for w, n in zip(shape, array.shape, strict=True)):
             needed = ", ".join("any" if n < 0 else str(n) for n in shape)

@@ -11,7 +11,7 @@ with one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
@@ -90,16 +90,10 @@ class RegulatedStretch(NamedTuple):
     levels: Array  # (n, m, 5): limits over their margins, coefficients as of `forces`
 
     def scale(self, b: float) -> tuple[float, Array, Array]:
-        """The plan with its squared speed times `b`, with the best internal force.
+        """Least level, c, (n, n_c + R) [N], and tau, (n, 2) [N m], at `b` times the squared speed.
 
-        Where a contact rolls that of the plan would let it slip at another speed. Case: query 1,
-        phase 5.
-
-        Returns
-        -------
-        level : float  least of the limits over their margins
-        c : (n, n_c + R) [N]
-        tau : (n, 2) [N m]
+        With the best internal force: that of the plan would let a rolling contact slip at another
+        speed. Case: query 1, phase 5.
         """
         zero, b_of_all = np.zeros(len(self.z)), np.full(len(self.z), b)
         level, internal = find_internal_force(self.levels, zero, b_of_all)
@@ -118,27 +112,15 @@ def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array
     return level, internal
 
 
-def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
-    """Times in phases, kept below the end, at which the contacts of the next phase hold."""
-    end = plan.phase_starts[phases[-1].index + 1]
-    return np.asarray(np.minimum(t, np.nextafter(end, 0.0)))
-
-
 def follow(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
 ) -> tuple[float, Array, Array, bool]:
-    """Squared speed over the plan's, torques and gains at even times in phases of a plan, (n,).
+    """Squared speed over the plan's, tau, (n, 2) [N m], and gains, (n, 2, 4), at n even times.
 
-    The speed is that with the largest least margin of normal forces and torques.
-
-    Returns
-    -------
-    b : float
-    tau, gains : (n, 2) [N m] and (n, 2, 4)
-    slow : bool  whether the last torques press all contacts in a slow motion
+    The speed is that with the largest least margin of normal forces and torques. Last comes whether
+    the last torques press all contacts in a slow motion.
     """
-    starts, t = plan.phase_starts, end_within(phases, plan, t)
-    step = float(t[1] - t[0])
+    starts, step = plan.phase_starts, float(t[1] - t[0])
 
     def divide(t: Array) -> list[RegulatedStretch]:
         owner = np.searchsorted(starts, t, side="right") - 1
@@ -148,11 +130,8 @@ def follow(
         ]
 
     parts = divide(t)
-
-    def find_margin(b: float) -> float:
-        return min(part.scale(b)[0] for part in parts)
-
-    b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
+    speeds = (1 - 0.05 * k for k in range(11))
+    b = max(speeds, key=lambda b: min(part.scale(b)[0] for part in parts))
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     # Mean torques of a period have the plan's impulse, also where it steps.
     within = np.clip(t[:, None] + step * (np.arange(8) - 3.5) / 8, t[0], t[-1]).ravel()
@@ -171,8 +150,14 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
 
     Accelerations and forces are those of the torques: between the samples of a loaded plan they
     step where modes change.
+
+    InputError if the plan has no spans of contact modes of the phase, as one along a curve.
     """
-    spans, names = list_modes(phase, plan), phase.formation.names
+    phases, names = plan.meta.get("modes", []), phase.formation.names
+    spans = phases[phase.index] if phase.index < len(phases) else ()
+    if not spans:
+        text = f"has no spans of phase {phase.number}, which the policy follows over time"
+        raise InputError("", "meta.modes", text)
     begins = [span["start"] for span in spans[1:]]
     owner = np.searchsorted(begins, t - plan.phase_starts[phase.index], side="right")
     for k in sorted(set(owner.tolist())):
@@ -194,18 +179,6 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         margins = np.where(torque, ROOM, PRESS * weights)
         levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
         yield RegulatedStretch(formation, z, v, directions, forces, levels)
-
-
-def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
-    """Spans of constant contact modes of a phase, as `ModeSpan`; the first begins with the phase.
-
-    InputError if the plan has none, as one along a curve.
-    """
-    modes = plan.meta.get("modes", [])
-    if phase.index >= len(modes) or not modes[phase.index]:
-        text = f"has no spans of phase {phase.number}, which the policy follows over time"
-        raise InputError("", "meta.modes", text)
-    return tuple(modes[phase.index])
 
 
 def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
@@ -294,8 +267,10 @@ def tabulate_motion(
     starts = plan.phase_starts[phases[0].index : phases[-1].index + 2].copy()
     starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
     count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
-    t = np.linspace(starts[0], starts[-1], count + 1)
-    samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
+    # At the very end the contacts of the next phase hold.
+    within = np.nextafter(plan.phase_starts[phases[-1].index + 1], 0.0)
+    t = np.minimum(np.linspace(starts[0], starts[-1], count + 1), within)
+    samples, last = plan.at(t), phases[-1]
     hold = hold_end(problem, last, samples.z[-1])
     inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
     # At the end each joint is critically damped, in contact or not.
@@ -351,8 +326,7 @@ def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Proble
         (block, *later), replacement = blocks, list[PhaseParts]()
         if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
             for stop, share, longest in STOPS:
-                stopped = _stop(block, plan, stop)
-                if stopped:
+                if stopped := _stop(block, plan, stop):
                     rest = [*stopped, *later]
                     replacement = _replan_blocks(planner, problem, rest, plan, share, longest)
                 if replacement:
@@ -440,10 +414,9 @@ def _replan_blocks(
 
 def _pin(phase: Phase, z: Array) -> Phase:
     """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
-    until = phase.until
-    fixed = {row for row, _ in until.poses}
-    gained = until.contact is not None
-    freedoms = len(z) - len(phase.formation.contacts) - gained - len(fixed)
-    names = [name for name in ("x", "phi") if ROWS[name] not in fixed][: max(freedoms, 0)]
+    until, fixed = phase.until, dict(phase.until.coordinates)
+    closed = len(phase.formation.contacts) + (until.contact is not None)
+    freedoms = len(z) - closed - len(fixed)
+    names = [name for name in ("x", "phi") if name not in fixed][: max(freedoms, 0)]
     pins = tuple((name, float(z[ROWS[name]])) for name in names)
     return replace(phase, until=replace(until, pins=until.pins + pins))
