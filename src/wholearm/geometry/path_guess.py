@@ -156,20 +156,16 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         slip = phase.formation.evaluate_slip(z[None])[0]
         middle = close_contacts(phase.formation, (z + next_end) / 2, slip)
         return next_end if middle is None else middle
-    slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
-    endings = list_ends(phase)
-    for end in endings:
-        goal, reason = _project(end, z, slip)
-        reasons.append(reason)
-        goals += [goal] if goal is not None else []
-    metric = metric_weights(phase.formation.scene)
-
-    if not goals:
-        goal = explore(phase.formation, z, slip, endings)
-        goals = [goal] if goal is not None else []
+    slip, endings = phase.formation.evaluate_slip(z[None])[0], list_ends(phase)
+    projected = [_project(end, z, slip) for end in endings]
+    goals = [goal for goal, _ in projected if goal is not None]
+    if not goals and (goal := explore(phase.formation, z, slip, endings)) is not None:
+        goals = [goal]
     if goals:
+        metric = metric_weights(phase.formation.scene)
         return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
-    raise InputError("", key, f"{phase.until} cannot be reached with these contacts{reasons[0]}")
+    text = f"{phase.until} cannot be reached with these contacts{projected[0][1]}"
+    raise InputError("", key, text)
 
 
 def list_ends(phase: Phase) -> list[Ending]:
