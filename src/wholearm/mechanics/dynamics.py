@@ -78,24 +78,17 @@ def stack_motion(a: Array, b: Array, internal: Array) -> Array:
     return np.stack([np.ones_like(b), a, b, np.sqrt(np.maximum(b, 0.0)), internal], axis=-1)
 
 
-def build_forward(formation: Formation) -> Expression:
-    """CasADi function (z, z', tau, Xi, sigma) -> (z'', c, K) of a formation.
-
-    K = P M5^-1 G^T is singular where the formation jams.
-    """
-    scene, n_c = formation.scene, formation.n_contacts
-    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
-    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
-    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
-    inverse_mass = ca.DM(1 / scene.mass_diagonal)
-    G = build_force_rows(formation, P, A_t, Xi)
-    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
-    K = P @ (inverse_mass * G.T)
-    c = ca.solve(K, -P_dot_v - P @ (inverse_mass * applied))
-    acceleration = inverse_mass * (applied + G.T @ c)
-    names = ["z", "v", "tau", "Xi", "sigma"], ["acceleration", "c", "K"]
-    return ca.Function("forward", [z, v, tau, Xi, sigma], [acceleration, c, K], *names)
+def forward(
+    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
+) -> tuple[Array, Array]:
+    """Z'' (n, 5) and contact forces c (n, n_c + R) of n states under torques tau (n, 2)."""
+    scene, kinematics = formation.scene, formation.evaluate(z, v)
+    over, G = kinematics.P / scene.mass_diagonal, force_rows(formation, kinematics, directions)
+    applied = scene.applied_force - scene.viscous * v
+    applied[:, 3:] += tau - scene.dry[3:] * directions.sigma
+    right = -kinematics.P_dot_v - np.einsum("nij,nj->ni", over, applied)
+    c = np.linalg.solve(over @ G.transpose(0, 2, 1), right[..., None])[..., 0]
+    return (applied + np.einsum("nij,ni->nj", G, c)) / scene.mass_diagonal, c
 
 
 def build_force_rows(
