@@ -360,17 +360,13 @@ class Pattern:
 
 
 class FreeRun(Run):
-    """A running simulation without prescribed contacts; other arguments are those of `Run`.
+    """A running simulation without prescribed contacts; other arguments are those of `Run`."""
 
-    Attributes
-    ----------
-    resting   whether everything rests
-    unique    whether the present modes were certainly the only solution
-    residual  largest residual of a contact problem so far
-    watched   which pairs do not press, (N,)
-    level     gap at which a pair that touches closes, (N,) [m]
-    """
-
+    resting: bool  # whether everything rests
+    unique: bool  # whether the present modes were certainly the only solution
+    residual: float  # largest residual of a contact problem so far
+    watched: NDArray[np.bool_]  # (N,): which pairs do not press
+    level: Array  # (N,) [m]: gap at which a pair that touches closes
     before: StepEnd
     after: StepEnd
 
@@ -911,5 +907,5 @@ class FreeRun(Run):
 
 
 def _name(system: System, joint: int) -> str:
-    driven = joint in system.driven
-    return f"joint {system.driven.index(joint) + 1}" if driven else f"coordinate {joint + 1}"
+    driven = system.structure.driven
+    return f"joint {driven.index(joint) + 1}" if joint in driven else f"coordinate {joint + 1}"

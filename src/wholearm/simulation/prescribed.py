@@ -123,31 +123,25 @@ Ending = Stop | Outcome
 
 
 class Replay(Run):
-    """A running simulation with prescribed contacts.
+    """A running simulation with prescribed contacts."""
 
-    Attributes
-    ----------
-    settling, rest_window : [s], rounding : [N]
-                             see the constants of these names
-    slip_signs               signs of contacts, by name, that have just begun to slip
-    ends                     what ends the phase
-    distance, rate           distance to its end [m or rad], and the time derivative of that
-    mode                     what rolls, sticks and is held
-    heading : (5,)           velocity at the start of a step, or the impending one, over its size in
-                             the metric M5
-    passes                   whether the end may be passed at any speed, without an impact
-    moving                   whether the motion goes on into the next phase
-    stuck                    contacts, then joints, that stick while the rest moves
-    minima                   whether to record where margins are least within steps, too
-    least                    c_n of contacts up to now in the phase, over the scene's force
-    """
-
-    ends: PhaseEnds
-    mode: modes.Mode
-    heading: Array
+    minima: bool  # whether to record where margins are least within steps, too
+    settling: float  # settling, rest_window [s], rounding [N]: see the constants of these names
+    rest_window: float
+    rounding: float
     phase: Phase
     following: Phase | None  # the next phase
-    least: Array
+    ends: PhaseEnds  # what ends the phase
+    distance: float  # to its end [m or rad]
+    rate: float  # time derivative of that
+    passes: bool  # whether the end may be passed at any speed, without an impact
+    moving: bool  # whether the motion goes on into the next phase
+    mode: modes.Mode  # what rolls, sticks and is held
+    # (5,): velocity at the start of a step, or the impending one, over its size in the metric M5
+    heading: Array
+    stuck: set[int]  # contacts, then joints, that stick while the rest moves
+    slip_signs: dict[str, float]  # of contacts that have just begun to slip
+    least: Array  # (n_c,): c_n up to now in the phase, over the scene's force
     releasable: tuple[str, ...]  # the contacts whose release ends the phase
     # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
     # the phase ends
@@ -166,8 +160,7 @@ class Replay(Run):
         self.held_until = self.settled_by = -math.inf
         self.distance = self.rate = 0.0
         self.passes = self.moving = False
-        self.stuck: set[int] = set()
-        self.slip_signs: dict[str, float] = {}
+        self.stuck, self.slip_signs = set(), {}
 
     @property
     def formation(self) -> Formation:
@@ -445,7 +438,7 @@ class Replay(Run):
         records, shown = list[Record](), math.inf
         for x in sorted(lowest):
             self.step_to(x * h)
-            records.append(Record.of(s, self.t + x * h, self.phase_index, self.impact))
+            records.append(self.read_outputs(self.t + x * h))
             self.least = np.minimum(self.least, self.values[force])
             if (self.values + self.slack < 0).any():
                 shown = min(shown, x * h)

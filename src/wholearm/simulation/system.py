@@ -120,11 +120,6 @@ class System:
         """Names of all pairs."""
         return self.structure.names
 
-    @property
-    def driven(self) -> tuple[int, ...]:
-        """Coordinates that the two torques act on."""
-        return self.structure.driven
-
     @cached_property
     def units(self) -> Array:
         """Units of z, then of z', shape (2 n,)."""
@@ -172,7 +167,8 @@ class System:
     def push(self, v: Array, tau: Array, sigma: Array) -> Array:
         """Forces on z but those of contacts, with dry friction in the directions `sigma`, (n,)."""
         force = self.applied - self.viscous * v - self.dry * sigma
-        force[list(self.driven)] += tau[: len(self.driven)]
+        driven = list(self.structure.driven)
+        force[driven] += tau[: len(driven)]
         return force
 
 
