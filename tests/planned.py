@@ -28,7 +28,8 @@ def forward(
     formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
 ) -> tuple[Array, Array]:
     """z'', shape (5,), and c, shape (n_c + R,), of one state."""
-    acceleration, c = dynamics.forward(formation, z[None], v[None], tau[None], directions)
+    at = formation.evaluate(z[None], v[None])
+    acceleration, c = dynamics.forward(formation, at, v[None], tau[None], directions)
     return acceleration[0], c[0]
 
 

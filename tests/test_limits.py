@@ -264,7 +264,7 @@ def test_slack_is_that_of_the_motion(curves: tuple[Curve, ...], phase: int) -> N
     directions = directions_of(curve, segment)
     forces = inverse(formation, *point[:3], directions, point.kinematics)
     tau, z_dot = forces.tau(a, b, internal), point.z_s * np.sqrt(b)[:, None]
-    acceleration, c = forward(formation, point.z, z_dot, tau, directions)
+    acceleration, c = forward(formation, formation.evaluate(point.z, z_dot), z_dot, tau, directions)
     z_ddot = point.z_s * a[:, None] + point.z_ss * b[:, None]
     np.testing.assert_allclose(acceleration, z_ddot, atol=1e-8)
     limits = make_limits(formation, EPSILON)

@@ -277,8 +277,8 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         tables = law.levels[k - 1], law.torque[k - 1]
         levels, torques = (curve_law._evaluate(table, 1.0, speed) for table in tables)
         tau = np.array(torques) @ [1.0, a, curve_law._choose_at(levels, a)[1]]
-        directions = Directions.of(phase.formation.evaluate(z[None], v[None]), v[None])
-        c = forward(phase.formation, z[None], v[None], tau[None], directions)[1]
+        at = phase.formation.evaluate(z[None], v[None])
+        c = forward(phase.formation, at, v[None], tau[None], Directions.of(at, v[None]))[1]
         assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone
 
 
@@ -462,7 +462,8 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     assert len(scenes) == 32
     for scene in scenes:
         formation = replace(curve.formation, scene=scene)
-        least = np.minimum(least, forward(formation, point.z, z_dot, tau, directions)[1])
+        at = formation.evaluate(point.z, z_dot)
+        least = np.minimum(least, forward(formation, at, z_dot, tau, directions)[1])
     rows, _, _ = within.at((a, b, squeeze))
     found = np.einsum("nmq,nq->nm", rows.slack[:, :4], known)
     assert found == pytest.approx(least, abs=1e-9)

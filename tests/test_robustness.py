@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import wholearm
+from planned import forward
 from retelling import Retelling, Units
 from rows import each
 from shipped import BOX, FOLDER, HEPTAGON, part_of, problem_of, text_of
@@ -375,7 +376,7 @@ def solve_forces(
     else:
         formation = replace(formation, scene=change_problem(heptagon, {name: change}).scene)
         z, v = replace_nearby(formation, z, v)
-    return np.asarray(dynamics.forward(formation, z[None], v[None], tau[None], directions)[1][0])
+    return forward(formation, z, v, tau, directions)[1]
 
 
 def require_slopes(
@@ -430,8 +431,7 @@ def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(heptagon: Problem
     v = np.linalg.svd(kinematics.P[0])[2][3:].T @ [0.2, -0.5]
     here = dynamics.Directions(np.sign(kinematics.A_t[0] @ v), np.sign(v[3:]))
     tau = np.array([0.7, -0.9])
-    found = dynamics.forward(formation, z[None], v[None], tau[None], here)
-    z_ddot, c = (part[0] for part in found)
+    z_ddot, c = forward(formation, z, v, tau, here)
     samples = Samples(*(part[None] for part in (z, v, z_ddot, tau, c, -0.1 * here.Xi * c)))
     rows = dynamics.Directions(here.Xi[None], here.sigma[None])
     slopes = find_slopes_at(formation, samples, rows, OFF)[0]
@@ -448,8 +448,9 @@ def find_least_in_corners(heptagon: Problem, formation: Formation, motion: Motio
     for signs in product((-1, 1), repeat=len(RADII)):
         changes = {name: sign * RADII[name] for name, sign in zip(RADII, signs, strict=True)}
         scene = change_problem(heptagon, changes).scene
-        given = samples.z, samples.z_dot, samples.tau, dynamics.Directions(Xi, sigma)
-        least = np.minimum(least, dynamics.forward(replace(formation, scene=scene), *given)[1])
+        at = replace(formation, scene=scene).evaluate(samples.z, samples.z_dot)
+        given = samples.z_dot, samples.tau, dynamics.Directions(Xi, sigma)
+        least = np.minimum(least, dynamics.forward(replace(formation, scene=scene), at, *given)[1])
     return least
 
 

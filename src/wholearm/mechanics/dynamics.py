@@ -79,12 +79,11 @@ def stack_motion(a: Array, b: Array, internal: Array) -> Array:
 
 
 def forward(
-    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
+    formation: Formation, kinematics: Kinematics, v: Array, tau: Array, directions: Directions
 ) -> tuple[Array, Array]:
-    """Z'' (n, 5) and contact forces c (n, n_c + R) of n states under torques tau (n, 2)."""
-    scene, kinematics = formation.scene, formation.evaluate(z, v)
-    over, G = kinematics.P / scene.mass_diagonal, force_rows(formation, kinematics, directions)
-    applied = scene.applied_force - scene.viscous * v
+    """Accelerations (n, 5) and contact forces (n, n_c + R) at velocities v under torques tau."""
+    scene, G = formation.scene, force_rows(formation, kinematics, directions)
+    over, applied = kinematics.P / scene.mass_diagonal, scene.applied_force - scene.viscous * v
     applied[:, 3:] += tau - scene.dry[3:] * directions.sigma
     right = -kinematics.P_dot_v - np.einsum("nij,nj->ni", over, applied)
     c = np.linalg.solve(over @ G.transpose(0, 2, 1), right[..., None])[..., 0]

@@ -183,8 +183,9 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         directions = Directions(*np.split(signs, [formation.n_contacts], axis=1))
         samples = plan.at(times)
         z, v = samples.z, samples.z_dot
-        acceleration, _ = forward(formation, z, v, plan.torque.at(times), directions)
-        forces = inverse(formation, z, v, acceleration, directions)
+        kinematics = formation.evaluate(z, v)
+        acceleration, _ = forward(formation, kinematics, v, plan.torque.at(times), directions)
+        forces = inverse(formation, z, v, acceleration, directions, kinematics)
         limits = make_limits(formation, 0.0).without(SPEED)
         weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
         torque = np.isin(limits.sides[0], limits.of(TORQUE))
@@ -212,7 +213,7 @@ def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linea
     weights, step = metric_weights(formation.scene), 1e-6
 
     def move(z: Array, v: Array, tau: Array) -> tuple[Array, Array]:
-        acceleration, c = forward(formation, z, v, tau, part.directions)
+        acceleration, c = forward(formation, formation.evaluate(z, v), v, tau, part.directions)
         return acceleration, c[:, : formation.n_contacts]
 
     N = _span(formation, formation.evaluate(z, v).P)

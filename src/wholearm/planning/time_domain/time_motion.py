@@ -96,7 +96,8 @@ class StageMotion:
                 np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
                 for part in (place, velocity)
             )
-            z_ddot, _ = forward(self.formation, here, rate, tau.reshape(-1, 2), self.directions)
+            at = self.formation.evaluate(here, rate)
+            z_ddot, _ = forward(self.formation, at, rate, tau.reshape(-1, 2), self.directions)
             accelerations = _fit(x, z_ddot.reshape(count, _NODES, 5))
             residual = np.abs(weights * (accelerations - a)).max(axis=(1, 2), keepdims=True)
             nearer = residual < least
@@ -133,14 +134,15 @@ class StageMotion:
         kinematics = formation.evaluate(z, v)
         v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
-        a, c = forward(formation, z, v, tau, self.directions)
+        a, c = forward(formation, formation.evaluate(z, v), v, tau, self.directions)
         return Samples(z, v, a, tau, *split_forces(formation, c, self.directions.Xi))
 
     def respond(self, t: Array) -> MotionResponse:
         """State, forces and accelerations at times `t`, and how these change with torques."""
-        at = self.evaluate(t)
+        at, formation = self.evaluate(t), self.formation
+        kinematics = formation.evaluate(at.z, at.z_dot)
         responses = [
-            forward(self.formation, at.z, at.z_dot, at.tau + step, self.directions)
+            forward(formation, kinematics, at.z_dot, at.tau + step, self.directions)
             for step in (np.zeros(2), *np.eye(2))
         ]
         a, c = (np.stack(parts, axis=-1) for parts in zip(*responses, strict=True))
