@@ -234,11 +234,8 @@ def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
         if leaving == 2 * n + 1:
             # From the original matrix.
             chosen = basis[basis > n] - n - 1
-            inner, z = M[np.ix_(chosen, chosen)], np.zeros(n)
-            try:
-                z[chosen] = np.linalg.solve(inner, -q[chosen])
-            except np.linalg.LinAlgError:
-                z[chosen] = np.linalg.lstsq(inner, -q[chosen])[0]
+            z = np.zeros(n)
+            z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen], rcond=None)[0]
             w = M @ z + q
             residual = max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w))
             return np.maximum(z, 0.0), float(residual)

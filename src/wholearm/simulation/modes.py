@@ -41,6 +41,7 @@ from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ..common.arrays import Array, sort_unique
@@ -393,7 +394,7 @@ class Rest:
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
-        tau = _evaluate(coefficients, x)
+        tau = polyval(np.asarray(x), coefficients.T)
         for mode in self.list_modes():
             if mode.moves(tau):
                 return mode.depart(x, tau)
@@ -409,7 +410,7 @@ class Rest:
         # Where a margin changes sign; in between, no mode changes.
         polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
         starts, middles = _split(polynomials, x)
-        torques = _evaluate(coefficients, middles)
+        torques = polyval(middles, coefficients.T)
         values = rows[:, :1] + rows[:, 1:] @ torques
         consistent = np.logical_and.reduceat(values >= 0, first, axis=0).T
         for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
@@ -423,7 +424,7 @@ class Rest:
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
-        tau = _evaluate(coefficients, x)
+        tau = polyval(np.asarray(x), coefficients.T)
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.list_modes() if mode.slides(tau)]
@@ -455,12 +456,6 @@ def _measure_drive(scene: Scene) -> float:
     return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
 
 
-def _evaluate(coefficients: Array, x: float | Array) -> Array:
-    """Torques at one place of a piece, shape (2,), or at n places, shape (2, n)."""
-    powers = np.power.outer(np.asarray(x), np.arange(coefficients.shape[1]))
-    return np.asarray(coefficients @ powers.T)
-
-
 def _constant(values: Array, coefficients: Array) -> Array:
     """Values, shape (m,), as polynomials of as many coefficients as those of a piece."""
     return np.pad(values[:, None], ((0, 0), (0, coefficients.shape[1] - 1)))
@@ -481,7 +476,7 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
 def find_breach(polynomials: Array, x: float) -> float:
     """First place in [x, 1] at which a polynomial of some, (n, d + 1), turns negative; infinity."""
     starts, middles = _split(polynomials, x)
-    low = (_evaluate(polynomials, middles) < 0).any(axis=0)
+    low = (polyval(middles, polynomials.T) < 0).any(axis=0)
     return float(starts[low.argmax()]) if low.any() else np.inf
 
 

@@ -36,6 +36,7 @@ import numpy as np
 
 from ..common.arrays import Array, find_lowest
 from ..common.errors import JammingError, SimulationError
+from ..common.sharing import bind
 from ..contacts.contact_limits import takes_over
 from ..contacts.elemental import build_features
 from ..contacts.formation import Formation
@@ -45,7 +46,7 @@ from ..results.torque import TorqueProfile
 from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES, bind
+from .stepper import INNER_STAGES, NODES
 from .system import (
     FIRST_STEP,
     REACHED,
@@ -107,7 +108,7 @@ def _build_ends(formation: Formation, until: Until, side: float) -> PhaseEnds:
     parts = *(limit.value for limit in limits), distance, ca.jtimes(distance, features.z, v)
     function = ca.Function("ends", [ca.vertcat(features.z, v)], [ca.densify(ca.vertcat(*parts))])
     state, values = np.zeros(10), np.zeros(len(parts))
-    evaluate, texts = bind(function, [state], values), [limit.text for limit in limits]
+    evaluate, texts = bind(function, [state], [values]), [limit.text for limit in limits]
     unit = 1.0 if until.coordinate == "phi" else scene.scales.length
     return PhaseEnds(evaluate, state, values, texts, unit)
 
@@ -683,11 +684,9 @@ class Replay(Run):
         if self._decide(turned, enters):
             return self.come_to_rest()
         self.observe()
-        if self._bridge(SETTLING):
-            return self.come_to_rest()
+        ended, c_n = self._bridge(SETTLING), self.s.outputs[self.s.to.c_n]
         # By more than rounding: phase 5 of leg 59 of seed 1128.
-        short = self.s.outputs[self.s.to.c_n] < 0.99 * self.problem.epsilon
-        if short.any() and self._bridge(BRIDGED):
+        if ended or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(BRIDGED)):
             return self.come_to_rest()
         self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
