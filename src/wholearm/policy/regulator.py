@@ -325,7 +325,7 @@ def tabulate_motion(
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     """Torques that hold all contacts at the end of a phase at rest, or None."""
     place, gap = find_standstill(problem, phase, z), GAP * problem.scene.scales.length
-    hold = find_hold(place, problem.epsilon, gap, 0.02)
+    hold = find_hold(place, problem.epsilon, gap)
     return None if hold is None else hold.tau
 
 

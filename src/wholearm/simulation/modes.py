@@ -550,25 +550,19 @@ class Hold(NamedTuple):
     parts: tuple[str, ...] = ()
 
 
-def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
+def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
     """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
     A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
-    torques do, or else with that which closes it in `time` [s].
+    torques do.
     """
     rest = _list_holding(place, epsilon)
     best = maximise_margin(place.formation.scene.torque_limit, rest)
     if best is None or best[1] < LEAST:
         return None
-    opening, firm = find_opening(place), Hold(*best)
-    if opening is None:
-        return firm
-    swift = 2 * gap / time**2
-    if closing := _find_closing(place, rest, opening, gap):
-        return closing
-    slow = _find_closing(place, rest, opening, gap, swift)
-    # Torques that close slowly hold less well than those that only hold, but by not too much.
-    return slow if slow is not None and slow.margin > 0.2 * firm.margin else firm
+    opening = find_opening(place)
+    closing = None if opening is None else _find_closing(place, rest, opening, gap)
+    return closing or Hold(*best)
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
@@ -614,13 +608,8 @@ def find_opening(place: Standstill) -> Array | None:
     return np.asarray(N @ push / rate)
 
 
-def _find_closing(
-    place: Standstill, rest: Array, opening: Array, gap: float, ample: float | None = None
-) -> Hold | None:
-    """Torques of largest margin that accelerate the formation towards a contact open by `gap`.
-
-    With a saturation value `ample` [m/s^2] that acceleration is one more margin, not a bound.
-    """
+def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) -> Hold | None:
+    """Torques of largest margin that accelerate the formation towards a contact open by `gap`."""
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
     scales, limits = scene.scales, scene.torque_limit
@@ -636,11 +625,8 @@ def _find_closing(
             rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
-        if ample is None:
-            bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
-            solution = maximise_margin(limits, rows, bound[None])
-        else:
-            solution = maximise_margin(limits, np.vstack([rows, closing / ample]))
+        bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
+        solution = maximise_margin(limits, rows, bound[None])
         if solution is None or solution[1] < max(LEAST, best.margin if best else 0.0):
             continue
         tau, margin = solution
