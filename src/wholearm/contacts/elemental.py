@@ -144,14 +144,11 @@ def parse_contact(name: object, scene: Scene) -> Contact:
 
 def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     """Every contact that the object can have with the palm (None) or with one finger."""
-    features = range(scene.polygon.n_vertices)
-    if finger is None:
-        return [Contact("v", i, "palm") for i in features]
-    contacts = [Contact("v", i, "finger", finger) for i in features]
-    contacts += [Contact("e", i, "tip", finger) for i in features]
-    if scene.fingers[finger].radius > 0:
-        contacts += [Contact("v", i, "tip", finger) for i in features]
-    return contacts
+    kinds, count = [("v", "palm")], scene.polygon.n_vertices
+    if finger is not None:
+        rounded = scene.fingers[finger].radius > 0
+        kinds = [("v", "finger"), ("e", "tip"), ("v", "tip")][: 2 + rounded]
+    return [Contact(kind, k, surface, finger) for kind, surface in kinds for k in range(count)]
 
 
 @stored(lambda scene: scene.shape)
