@@ -9,13 +9,13 @@ contact forces c = [c_n; c_t(rolling)] are as many as the constraints, n_c + R, 
 
     G = [A - U Xi A_t; A_t(rolling)],  with zero for U Xi of a rolling contact,
 
-are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Where
-nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the equations:
+are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Three
+routes through the equations:
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
   number, the internal force lambda, and the joints' rows then give tau;
-* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.reduced`).
+* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.verify`).
 
 Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
 det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inertia`.

@@ -5,9 +5,8 @@ joint with theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
-Vertices of a flush edge slide and stick as one. Only the sum T of their c_t is determined, with
-|T| <= sum mu c_n; it is distributed in proportion to c_n, which does not affect the motion. A
-contact flush with a rolling one has no friction of its own.
+Vertices of a flush edge slide and stick as one, with one force T of friction (`stepper`), |T| <=
+sum mu c_n. A contact flush with a rolling one has no friction of its own.
 
 **At rest.** Each choice of signs of sliding and turning, and of what sticks, makes accelerations
 and contact forces affine in the torques. Such a start mode is consistent if contacts and joints
@@ -369,7 +368,7 @@ class Rest:
     def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
         scene, count = self.formation.scene, self.formation.n_contacts
-        rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
+        rows = ContactRows(self.statics.A, self.statics.A_t, *np.zeros((3, count)))
         response = respond(mode, signs, rows, np.zeros(5))
         if response is None:
             return None

@@ -606,14 +606,12 @@ class Replay(Run):
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
-        names, kept = formation.names, following.formation.names
-        rolled, rolls = ({c.name for c in p.formation.rolling} for p in (phase, following))
-        self.releasable = tuple(name for name in names if name not in kept)
+        contacts, kept = formation.contacts, set(following.formation.contacts)
+        rolled, rolls = (set(each.formation.rolling) for each in (phase, following))
+        self.releasable = tuple(c.name for c in contacts if c not in kept)
         if not self.releasable:
-            self.resting = frozenset(k for k, name in enumerate(names) if name in rolls - rolled)
-        self.slipping = frozenset(
-            k for k, name in enumerate(names) if name in rolled - rolls and name in kept
-        )
+            self.resting = frozenset(k for k, c in enumerate(contacts) if c in rolls - rolled)
+        self.slipping = frozenset(k for k, c in enumerate(contacts) if c in (rolled - rolls) & kept)
 
     def _close(self, formation: Formation) -> Array:
         """The present configuration with every contact of a formation closed."""

@@ -50,7 +50,7 @@ class Run(ABC):
         z: Array,
         v: Array,
         tolerance: float = 1e-9,
-        wanted: Array | None = None,
+        wanted: Sequence[float] | Array = (),
     ) -> None:
         self.feedback = torque if isinstance(torque, Feedback) else None
         torque = torque.torque if isinstance(torque, Feedback) else torque
@@ -64,9 +64,8 @@ class Run(ABC):
         self.phase_index = self.steps = self.rejected = 0
         self.records: list[Record] = []
         self.events: list[Event] = []
-        wanted = np.zeros(0) if wanted is None else wanted
-        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted, self.next_wanted = [*within.tolist(), math.inf], 0
+        within = (t for t in wanted if self.breaks[0] <= t <= self.breaks[-1])
+        self.wanted, self.next_wanted = [*map(float, within), math.inf], 0
         self.residual = 0.0
         self.sample()
         self.decisions, self.decided_at = 0, -math.inf

@@ -165,7 +165,7 @@ class ModeStepper:
         inputs[at.units] = system.units
         inputs[at.scales] = system.scales.force, system.scales.speed
         inputs[at.friction_units] = system.friction_units
-        slip = system.evaluate_slip(z, [pairs[0] for pairs in self.modes.stuck])
+        slip = system.evaluate(z, z, [pairs[0] for pairs in self.modes.stuck]).slip
         inputs[at.stay] = np.concatenate([slip, z[list(self.modes.held)]])
 
 

@@ -46,6 +46,7 @@ class ContactRows(NamedTuple):
     A_t: Array
     bend: Array  # bend, bend_t (m,): A' z' and A_t' z'
     bend_t: Array
+    slip: Array  # (m,) [m]: slip coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +138,10 @@ class System:
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> ContactRows:
         """Rows of some pairs at one state."""
-        n, rows = self.n, self._evaluate(z, v, chosen)
-        return ContactRows(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1])
-
-    def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
-        """Slip coordinates of some pairs, shape (m,) [m]."""
-        return self._evaluate(z, z, chosen)[:, -1]
-
-    def _evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Array:
-        if not len(chosen):
-            return np.zeros((0, 2 * self.n + 3))
-        return _build_rows(self.structure, tuple(chosen)).at(z, v, self.geometry)[0]
+        n, rows = self.n, np.zeros((0, 2 * self.n + 3))
+        if len(chosen):
+            rows = _build_rows(self.structure, tuple(chosen)).at(z, v, self.geometry)[0]
+        return ContactRows(rows[:, :n], rows[:, n : 2 * n], *rows[:, 2 * n :].T)
 
     def look(self, z: Array) -> tuple[Array, Array]:
         """As `measure`, at one place: shape (N,) each [m]."""
