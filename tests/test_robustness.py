@@ -43,7 +43,7 @@ from wholearm.common.parallel import connect, run_all
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import dynamics
-from wholearm.mechanics.sensitivity import find_force_slopes, find_slopes_at
+from wholearm.mechanics.sensitivity import Sensitivity, find_slopes_at
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
@@ -407,8 +407,8 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(which: str) -> None:
     segment = np.searchsorted([part.stop for part in way.segments][:-1], [s])
     directions = directions_of(way, segment)
     forces = dynamics.inverse(way.formation, *point[:3], directions, point.kinematics)
-    table = find_force_slopes(way.formation, point, directions, forces, [*names, "start_x"])[0]
-    slopes = table @ dynamics.stack_motion(a, b, squeeze)[0]
+    along = Sensitivity.of_curve(way.formation, point, directions, forces)
+    slopes = along.find_slopes([*names, "start_x"])[0] @ dynamics.stack_motion(a, b, squeeze)[0]
     tau, here = (
         forces.tau(a, b, squeeze)[0],
         dynamics.Directions(directions.Xi[0], directions.sigma[0]),
