@@ -236,7 +236,6 @@ def evaluate_best(path: PathSamples, profile: str) -> Evaluate:
 def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     """Least normal force by a steady speed, under given torques, shape (n, 2) [N m]."""
     limits = path.force_limits.limits
-    of_c, of_tau, of_rates = limits.columns
     owners, soft = limits.owners, limits.of(PRESS, CONE)
     weights = np.concatenate([limit.weight for limit in limits.limits])[soft]
     others = np.setdiff1d(np.arange(len(owners)), soft)
@@ -245,7 +244,7 @@ def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
 
     def evaluate(speed: float) -> Least:
         rates = speed * path.point.z_s[:, 3:]
-        values = path.press_under(tau, speed) @ of_c.T + tau @ of_tau.T + rates @ of_rates.T
+        values = np.hstack([path.press_under(tau, speed), tau, rates]) @ limits.rows.T
         force, rest = values[:, soft] / weights, values[:, others]
         over = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
         force[over.any(axis=1)] = -np.inf

@@ -662,12 +662,9 @@ def find_resting_changes(
 def find_sides(limits: LimitSet, response: modes.Response, v: Array) -> Array:
     """Slack of one-sided limits at velocity v, (5,), rows @ (1, tau_1, tau_2), (n_sides, 3)."""
     formation = response.mode.formation
-    of_c, of_tau, of_rates = limits.columns
-    rolling = response.c_t[list(formation.rolling_rows)]
-    values = of_c @ np.vstack([response.c[: formation.n_contacts], rolling])
-    values[:, 1:] += of_tau
-    values[:, 0] += of_rates @ v[3:]
-    return limits.find_slack_rows(values)
+    forces = response.c[: formation.n_contacts], response.c_t[list(formation.rolling_rows)]
+    y = np.vstack([*forces, np.eye(3)[1:], np.column_stack([v[3:], np.zeros((2, 2))])])
+    return limits.find_slack_rows(limits.rows @ y)
 
 
 def find_moving(
