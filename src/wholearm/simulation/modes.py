@@ -611,9 +611,8 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
     """Torques of largest margin that accelerate the formation towards a contact open by `gap`."""
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
-    scales, limits = scene.scales, scene.torque_limit
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
-    held = Statics(place.formation, z).torque_polygon()
+    scales, held = scene.scales, Statics(place.formation, z).torque_polygon()
     creep = DRIVE * np.repeat(
         [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
     )
@@ -624,8 +623,8 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
             rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
-        bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
-        solution = maximise_margin(limits, rows, bound[None])
+        enough = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
+        solution = maximise_margin(scene.torque_limit, rows, enough[None])
         if solution is None or solution[1] < max(LEAST, best.margin if best else 0.0):
             continue
         tau, margin = solution
