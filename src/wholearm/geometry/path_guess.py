@@ -64,15 +64,14 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     places = _list_places(formation, z)
     nearest, least = None, np.inf
     for end in ends:
-        order = np.argsort(end.measure(places))[:24]
-        for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
+        for k in np.argsort(end.measure(places))[:24]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
                 continue
-            distance = float(metric @ (goal - z) ** 2)
+            distance = float(np.sqrt(metric @ (goal - z) ** 2))
             # One that holds at the start is no end to go to.
-            if STILL * formation.scene.scales.length < np.sqrt(distance) < least:
-                nearest, least = goal, np.sqrt(distance)
+            if STILL * formation.scene.scales.length < distance < least:
+                nearest, least = goal, distance
     return nearest
 
 
@@ -185,17 +184,13 @@ def list_ends(phase: Phase) -> list[Ending]:
 def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     """Nearest end by an active-set method with up to two limits, or what blocks it."""
     formation, active, reason = end.formation, end.active, ""
-    goal = close_contacts(formation, z, slip, end.fixed, active)
-    while goal is not None:
-        limits = formation.evaluate_limits(goal[None])[0]
-        if limits.min() > -formation.scene.touching:
-            return goal, ""
-        worst = int(limits.argmin())
+    for _ in range(3):
+        goal = close_contacts(formation, z, slip, end.fixed, active)
+        if goal is None or is_inside(formation, goal):
+            return goal, reason
+        worst = int(formation.evaluate_limits(goal[None])[0].argmin())
         reason = f": {formation.limits[worst].text} first"
-        if worst in active or len(active) == 2 + len(end.active):
-            break
-        active = (*active, worst)
-        goal = close_contacts(formation, goal, slip, end.fixed, active)
+        z, active = goal, (*active, worst)
     return None, reason
 
 
