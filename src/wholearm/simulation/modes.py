@@ -335,14 +335,10 @@ class Rest:
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
         formation, none = self.formation, np.zeros(self.formation.n_contacts + 2)
-        patterns = list_modes(formation, none, list_units(formation), held)
-        candidates = [
-            (mode, signs)
-            for signs, mode in patterns
-            if (len(mode.holders) > formation.n_rolling) == held
-        ]
-        candidates.sort(key=lambda pattern: len(pattern[0].holders))
-        modes = (self._build(*pattern) for pattern in candidates)
+        every = list_modes(formation, none, list_units(formation), held)
+        patterns = [one for one in every if (len(one[1].holders) > formation.n_rolling) == held]
+        patterns.sort(key=lambda pattern: len(pattern[1].holders))
+        modes = (self._build(mode, signs) for signs, mode in patterns)
         return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
@@ -433,9 +429,8 @@ class Rest:
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
             row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(x, self.formation.names[row], least, jams, c_t)
-        return Collapse(
-            x, self.touching.formation.names[int(pulls.argmax())], -float(pulls.max()), jams
-        )
+        row = int(pulls.argmax())
+        return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
