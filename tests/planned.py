@@ -18,7 +18,8 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse
+from wholearm.mechanics import dynamics
+from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse
 from wholearm.results.dwell_record import assemble
 from wholearm.results.trajectory import Samples, Trajectory
 
@@ -27,8 +28,9 @@ def forward(
     formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
 ) -> tuple[Array, Array]:
     """z'', shape (5,), and c, shape (n_c + R,), of one state."""
-    acceleration, c, _ = build_forward(formation)(z, v, tau, *directions)
-    return np.asarray(acceleration.full()[:, 0]), np.asarray(c.full()[:, 0])
+    at = formation.evaluate(z[None], v[None])
+    acceleration, c = dynamics.forward(formation, at, v[None], tau[None], directions)
+    return acceleration[0], c[0]
 
 
 DEPENDENT = [1, 3, 4]

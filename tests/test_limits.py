@@ -25,7 +25,7 @@ from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics import speed_sweep
-from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
+from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, forward, inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
 from wholearm.mechanics.path_limits import InternalForceLimits, PathLimits, find_speed_cap
 from wholearm.planning.explain import change_limit, list_shortfalls
@@ -264,13 +264,11 @@ def test_slack_is_that_of_the_motion(curves: tuple[Curve, ...], phase: int) -> N
     directions = directions_of(curve, segment)
     forces = inverse(formation, *point[:3], directions, point.kinematics)
     tau, z_dot = forces.tau(a, b, internal), point.z_s * np.sqrt(b)[:, None]
-    forward = build_forward(formation).map(count)
-    signs = (part.T for part in directions)
-    acceleration, c, _ = forward(point.z.T, z_dot.T, tau.T, *signs)
+    acceleration, c = forward(formation, formation.evaluate(point.z, z_dot), z_dot, tau, directions)
     z_ddot = point.z_s * a[:, None] + point.z_ss * b[:, None]
-    np.testing.assert_allclose(acceleration.full().T, z_ddot, atol=1e-8)
+    np.testing.assert_allclose(acceleration, z_ddot, atol=1e-8)
     limits = make_limits(formation, EPSILON)
-    values = np.hstack([c.full().T, tau, z_dot[:, 3:]]) @ limits.rows.T
+    values = np.hstack([c, tau, z_dot[:, 3:]]) @ limits.rows.T
     rows = limits.sides[0]
     slack = limits.find_slack(values) / limits.scales[rows]
     fast = np.isin(rows, limits.of("speed"))

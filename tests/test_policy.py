@@ -24,7 +24,7 @@ from wholearm.analysis.robustness import make_trial
 from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mapping.formation_list import write_template
-from wholearm.mechanics.dynamics import build_forward
+from wholearm.mechanics.dynamics import Directions, forward
 from wholearm.mechanics.limits import force_limit_rows
 from wholearm.policy import curve_law, make, regulator
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
@@ -277,8 +277,8 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         tables = law.levels[k - 1], law.torque[k - 1]
         levels, torques = (curve_law._evaluate(table, 1.0, speed) for table in tables)
         tau = np.array(torques) @ [1.0, a, curve_law._choose_at(levels, a)[1]]
-        signs = np.sign(phase.formation.evaluate(z[None], v[None]).A_t[0] @ v), np.sign(v[3:])
-        c = build_forward(phase.formation)(z, v, tau, *signs)[1].full()
+        at = phase.formation.evaluate(z[None], v[None])
+        c = forward(phase.formation, at, v[None], tau[None], Directions.of(at, v[None]))[1]
         assert c.min() > -0.03 * problem.scene.scales.force  # -0.5 with limits of one side alone
 
 
@@ -457,12 +457,13 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     point, part = curve.evaluate(s), curve.segments[0]
     assert part.stop > s[-1]
     z_dot = point.z_s * np.sqrt(b)[:, None]
-    signs = [np.tile(own, (3, 1)).T for own in (part.Xi, part.sigma)]
+    directions = Directions(part.Xi, part.sigma)
     least, scenes = np.full((3, 4), np.inf), make.list_scenes(ranged.scene, widths)
     assert len(scenes) == 32
     for scene in scenes:
-        forward = build_forward(replace(curve.formation, scene=scene)).map(3)
-        least = np.minimum(least, forward(point.z.T, z_dot.T, tau.T, *signs)[1].full().T)
+        formation = replace(curve.formation, scene=scene)
+        at = formation.evaluate(point.z, z_dot)
+        least = np.minimum(least, forward(formation, at, z_dot, tau, directions)[1])
     rows, _, _ = within.at((a, b, squeeze))
     found = np.einsum("nmq,nq->nm", rows.slack[:, :4], known)
     assert found == pytest.approx(least, abs=1e-9)

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import wholearm
+from planned import forward
 from retelling import Retelling, Units
 from rows import each
 from shipped import BOX, FOLDER, HEPTAGON, part_of, problem_of, text_of
@@ -42,7 +43,7 @@ from wholearm.common.parallel import connect, run_all
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import dynamics
-from wholearm.mechanics.sensitivity import find_force_slopes, find_slopes_at
+from wholearm.mechanics.sensitivity import Sensitivity, find_slopes_at
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
@@ -375,8 +376,7 @@ def solve_forces(
     else:
         formation = replace(formation, scene=change_problem(heptagon, {name: change}).scene)
         z, v = replace_nearby(formation, z, v)
-    found = dynamics.build_forward(formation)(z, v, tau, directions.Xi, directions.sigma)
-    return np.asarray(found[1].full()[:, 0])
+    return forward(formation, z, v, tau, directions)[1]
 
 
 def require_slopes(
@@ -407,8 +407,8 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(which: str) -> None:
     segment = np.searchsorted([part.stop for part in way.segments][:-1], [s])
     directions = directions_of(way, segment)
     forces = dynamics.inverse(way.formation, *point[:3], directions, point.kinematics)
-    table = find_force_slopes(way.formation, point, directions, forces, [*names, "start_x"])[0]
-    slopes = table @ dynamics.stack_motion(a, b, squeeze)[0]
+    along = Sensitivity.of_curve(way.formation, point, directions, forces)
+    slopes = along.find_slopes([*names, "start_x"])[0] @ dynamics.stack_motion(a, b, squeeze)[0]
     tau, here = (
         forces.tau(a, b, squeeze)[0],
         dynamics.Directions(directions.Xi[0], directions.sigma[0]),
@@ -431,8 +431,7 @@ def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(heptagon: Problem
     v = np.linalg.svd(kinematics.P[0])[2][3:].T @ [0.2, -0.5]
     here = dynamics.Directions(np.sign(kinematics.A_t[0] @ v), np.sign(v[3:]))
     tau = np.array([0.7, -0.9])
-    found = dynamics.build_forward(formation)(z, v, tau, here.Xi, here.sigma)
-    z_ddot, c = (part.full()[:, 0] for part in found[:2])
+    z_ddot, c = forward(formation, z, v, tau, here)
     samples = Samples(*(part[None] for part in (z, v, z_ddot, tau, c, -0.1 * here.Xi * c)))
     rows = dynamics.Directions(here.Xi[None], here.sigma[None])
     slopes = find_slopes_at(formation, samples, rows, OFF)[0]
@@ -449,9 +448,9 @@ def find_least_in_corners(heptagon: Problem, formation: Formation, motion: Motio
     for signs in product((-1, 1), repeat=len(RADII)):
         changes = {name: sign * RADII[name] for name, sign in zip(RADII, signs, strict=True)}
         scene = change_problem(heptagon, changes).scene
-        forward = dynamics.build_forward(replace(formation, scene=scene)).map(len(Xi))
-        given = samples.z.T, samples.z_dot.T, samples.tau.T, Xi.T, sigma.T
-        least = np.minimum(least, forward(*given)[1].full().T)
+        at = replace(formation, scene=scene).evaluate(samples.z, samples.z_dot)
+        given = samples.z_dot, samples.tau, dynamics.Directions(Xi, sigma)
+        least = np.minimum(least, dynamics.forward(replace(formation, scene=scene), at, *given)[1])
     return least
 
 

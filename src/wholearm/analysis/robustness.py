@@ -32,7 +32,7 @@ from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from ..simulation.events import FreeSimulation, OutcomeKind
+from ..simulation.events import OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free
 from ..verification.free import MOMENT, REACHED, TURNED, find_touch, list_aliases, list_gained
 
@@ -206,7 +206,7 @@ class Trial:
         changes: Mapping[str, float],
         torque: TorqueProfile | ClosedLoop,
         tolerance: float = 1e-9,
-    ) -> FreeSimulation:
+    ) -> Simulation:
         """Replay torques in the scene whose numbers are off, free of assumptions.
 
         InputError, SimulationError if the changed scene has no start.
@@ -221,9 +221,7 @@ class Trial:
             until = torque.find_limit(self.windows[-1].phase)
         return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
-    def judge(
-        self, simulation: FreeSimulation, began: float, stops: Sequence[float]
-    ) -> dict[str, Any]:
+    def judge(self, simulation: Simulation, began: float, stops: Sequence[float]) -> dict[str, Any]:
         """Compare a motion, and when its phases start and stop [s], with the plan; as `run`.
 
         A phase goes on from when the last one's contact was gained to when its own is, or to its
@@ -567,9 +565,7 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
     return Sensitivities(contact, time, least, tuple(sensitivities))
 
 
-def find_least(
-    simulation: FreeSimulation, windows: tuple[TimeWindow, ...]
-) -> tuple[str, float, float]:
+def find_least(simulation: Simulation, windows: tuple[TimeWindow, ...]) -> tuple[str, float, float]:
     """The planned contact that presses least, when, and its c_n; none has no name."""
     t = simulation.t
     events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])

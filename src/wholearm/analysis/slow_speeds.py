@@ -29,7 +29,7 @@ from ..mechanics.dynamics import (
     Directions,
     PathForces,
     close_all,
-    force_rows,
+    forward,
     inverse,
     metric_weights,
     reduced_inertia,
@@ -229,7 +229,6 @@ def evaluate_best(path: PathSamples, profile: str) -> Evaluate:
 def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     """Least normal force by a steady speed, under given torques, shape (n, 2) [N m]."""
     limits = path.force_limits.limits
-    of_c, of_tau, of_rates = limits.columns
     owners, soft = limits.owners, limits.of(PRESS, CONE)
     weights = np.concatenate([limit.weight for limit in limits.limits])[soft]
     others = np.setdiff1d(np.arange(len(owners)), soft)
@@ -238,7 +237,7 @@ def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
 
     def evaluate(speed: float) -> Least:
         rates = speed * path.point.z_s[:, 3:]
-        values = path.press_under(tau, speed) @ of_c.T + tau @ of_tau.T + rates @ of_rates.T
+        values = np.hstack([path.press_under(tau, speed), tau, rates]) @ limits.rows.T
         force, rest = values[:, soft] / weights, values[:, others]
         over = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
         force[over.any(axis=1)] = -np.inf
@@ -306,16 +305,11 @@ class PathSamples:
     def press_under(self, tau: Array, speed: float) -> Array:
         """Contact forces [c_n; c_t(rolling)] under torques `tau`, (n, 2), at a speed, (n, n_c + R).
 
-        Whatever acceleration these give: K c = -P' z' - P M5^-1 (g + S tau - b).
+        Whatever acceleration these give.
         """
-        scene = self.phase.formation.scene
-        at, inverse_mass = self.point.kinematics, 1 / scene.mass_diagonal
-        G = force_rows(self.phase.formation, at, self.directions)
-        load = scene.applied_force - speed * scene.viscous * self.point.z_s
-        load[:, 3:] += tau - scene.dry[3:] * self.directions.sigma
-        drop = at.P * inverse_mass
-        right = -(speed**2) * at.P_dot_v - np.einsum("nij,nj->ni", drop, load)
-        return np.asarray(np.linalg.solve(drop @ G.transpose(0, 2, 1), right[..., None])[..., 0])
+        at, v = self.point.kinematics, speed * self.point.z_s
+        at = at._replace(P_dot_v=speed**2 * at.P_dot_v)
+        return forward(self.phase.formation, at, v, tau, self.directions)[1]
 
 
 def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples | None:

@@ -25,7 +25,7 @@ from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile, format_rows
 from ..simulation.complementarity import FreeRun
-from ..simulation.events import Event, EventKind, FreeSimulation
+from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
@@ -732,7 +732,7 @@ class PassageTuner:
         gap = float(self.measure(run.z[None])[0])
         return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
 
-    def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
+    def _judge(self, steps: tuple[TuningStep, ...], simulation: Simulation) -> TuningTrial:
         gaps = self.measure(simulation.z)
         ends, lost = self.passage.follow(simulation.events)
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf

@@ -41,7 +41,7 @@ from ..contacts.formation import Formation
 from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
 from ..geometry.tracing import trace_phases
-from ..mechanics.dynamics import ONE, A, B, build_force_rows, build_forward, inverse
+from ..mechanics.dynamics import ONE, A, B, build_force_rows, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
 from ..planning.lower_bound import bound_least_time
@@ -299,7 +299,11 @@ def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
     # Coefficients come column by column.
     powers = ca.reshape(flat, 2, -1)[:, ::-1]
     tau = ca.vertcat(*(ca.polyval(powers[k, :].T, place) for k in range(2)))
-    rates = ca.vertcat(y[5:], build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)[0])
+    # Accelerations of the contacts are affine in the forces, and have to vanish.
+    plant, c_n = build_plant(formation), ca.SX.sym("c_n", n_c)
+    of_forces, apart = ca.linear_coeff(plant(y[:5], y[5:], tau, c_n, Xi, sigma)[1], c_n)
+    forces = -ca.solve(of_forces, apart)
+    rates = ca.vertcat(y[5:], plant(y[:5], y[5:], tau, forces, Xi, sigma)[0])
     system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, piece, ends), "ode": half * rates}
     options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
     options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}

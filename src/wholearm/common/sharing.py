@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import wraps
 from threading import RLock
 from typing import Any, ParamSpec, TypeVar
@@ -90,6 +90,18 @@ def _drop_locals(error: BaseException) -> None:
         clear_frames(one.__traceback__)
 
 
+def bind(function: Expression, inputs: Sequence[Array], outputs: Sequence[Array]) -> Any:
+    """A call of a CasADi function of dense arrays, which stay in place and live as long."""
+    buffer, call = function.buffer()
+    for k, values in enumerate(inputs):
+        buffer.set_arg(k, values.data)
+    for k, values in enumerate(outputs):
+        buffer.set_res(k, values.data)
+    # Buffers keep raw pointers into the arrays.
+    call.kept = buffer, inputs, outputs
+    return call
+
+
 class Batch:
     """A CasADi function of column vectors, called on rows of NumPy arrays.
 
@@ -106,17 +118,11 @@ class Batch:
         self._arguments = [np.zeros((most, function.size1_in(i))) for i in inputs]
         shapes = [function.size_out(i) for i in range(function.n_out())]
         self._results = [np.zeros((most, columns, rows)) for rows, columns in shapes]
-        # Buffers keep raw pointers into the same arrays, so they have to live as long.
-        self._calls = [self._prepare(function, size) for size in self.sizes]
-
-    def _prepare(self, function: Expression, size: int) -> tuple[int, Expression, Expression]:
-        """A number of points, the buffer of a call for as many, and what runs it."""
-        buffer, run = (function if size == 1 else function.map(size)).buffer()
-        for i, argument in enumerate(self._arguments):
-            buffer.set_arg(i, argument[:size].data)
-        for i, result in enumerate(self._results):
-            buffer.set_res(i, result[:size].data)
-        return size, buffer, run
+        self._calls = []  # a number of points, and a call for as many
+        for size in self.sizes:
+            inner, outer = ([x[:size] for x in y] for y in (self._arguments, self._results))
+            call = bind(function if size == 1 else function.map(size), inner, outer)
+            self._calls.append((size, call))
 
     @exclusive
     def __call__(self, *arguments: Array) -> list[Array]:
@@ -129,7 +135,7 @@ class Batch:
         stop = 0
         while stop < count:
             start, left = stop, count - stop
-            size, _, run = self._calls[0 if left <= 5 else 1 if left <= 60 else 2]
+            size, run = self._calls[0 if left <= 5 else 1 if left <= 60 else 2]
             stop = min(start + size, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
                 store[: stop - start] = argument[start:stop]
@@ -146,5 +152,5 @@ class Batch:
         """
         for store, argument in zip(self._arguments, point, strict=True):
             store[0] = argument
-        self._calls[0][2]()
+        self._calls[0][1]()
         return [result[0].copy() for result in self._results]

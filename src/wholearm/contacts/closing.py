@@ -154,9 +154,7 @@ def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Number
 
     Vertices `x`, `y`, (m, n), are relative to the joint.
     """
-    sign = 1.0 if finger == 0 else -1.0
-    outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
-    length, radius = link.length, link.radius
+    length, radius, (sign, outside) = link.length, link.radius, _find_outside(finger)
     along_x, along_y = (np.roll(part, -1, axis=0) - part for part in (x, y))
     size = np.hypot(along_x, along_y)
     along_x, along_y = along_x / size, along_y / size
@@ -191,6 +189,11 @@ def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Number
     feature = np.concatenate(touching).argmax(axis=0)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
+
+
+def _find_outside(finger: int) -> tuple[float, float]:
+    """Sense in which a finger closes, 1 anticlockwise, and the angle from which it does [rad]."""
+    return 1.0 - 2 * finger, (2 * finger - 0.5) * np.pi
 
 
 def _find_angle(
@@ -267,25 +270,21 @@ def name_reach(scene: Scene, phi: float) -> str:
 def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
-    z[:, [0, 2]] = poses
-    body = scene.polygon.vertices
-    run = np.roll(body, -1, axis=0) - body
-    along = run / np.hypot(run[:, 0], run[:, 1])[:, None]
-    normals = np.column_stack([along[:, 1], -along[:, 0]])
-    z[:, 1] = -_turn(body[labels[:, 0]], poses[:, 1])[:, 1]
+    z[:, [0, 2]], z[:, 1], count = poses, 0.0, scene.polygon.n_vertices
+    z[:, 1] = -place_corners(scene, z[:, 0], z[:, 1], z[:, 2], labels[None, :, 0])[1][0]
     for finger, link in enumerate(scene.fingers):
-        sign = 1.0 if finger == 0 else -1.0
-        kinds, indices = np.divmod(labels[:, 1 + finger] - first_contact(scene, finger), len(body))
+        sign, outside = _find_outside(finger)
+        kinds, indices = np.divmod(labels[:, 1 + finger] - first_contact(scene, finger), count)
         for kind in np.unique(kinds).tolist():
             rows = np.flatnonzero(kinds == kind)
-            corner, outward = (_turn(x[indices[rows]], poses[rows, 1]) for x in (body, normals))
-            x, y = (corner + z[rows, :2] - np.asarray(link.base)).T
+            ends = np.stack([indices[rows], indices[rows] + 1]) % count
+            x, y = place_corners(scene, z[rows, 0], z[rows, 1], z[rows, 2], ends)
+            outward = np.stack([y[1] - y[0], x[0] - x[1]]) / np.hypot(x[1] - x[0], y[1] - y[0])
+            base = np.asarray(link.base)
             with np.errstate(invalid="ignore", divide="ignore"):
-                angle = _find_angle(link, sign, kind, x, y, outward.T)
+                angle = _find_angle(link, sign, kind, x[0] - base[0], y[0] - base[1], outward)
             # Counted from where the finger hangs outside, from which it closes.
-            outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
-            swept = np.mod(sign * (angle - outside), 2 * np.pi)
-            z[rows, 3 + finger] = outside + sign * swept
+            z[rows, 3 + finger] = outside + sign * np.mod(sign * (angle - outside), 2 * np.pi)
     return z
 
 
@@ -306,11 +305,3 @@ def move(
         z_uu[:, 1] = -at.P_dot_v[:, 0]
         z_uu[:, 3:] = -(at.P_dot_v[:, 1:] + A[:, 1:, 1] * z_uu[:, 1:2]) / levers
     return z, z_u, z_uu, at
-
-
-def _turn(vectors: Array, phi: Array) -> Array:
-    c, s = np.cos(phi), np.sin(phi)
-    turned = np.empty_like(vectors)
-    turned[:, 0] = c * vectors[:, 0] - s * vectors[:, 1]
-    turned[:, 1] = s * vectors[:, 0] + c * vectors[:, 1]
-    return turned

@@ -178,11 +178,11 @@ def list_renamed(
     scene: Scene, before: Sequence[Contact], after: Sequence[Contact]
 ) -> dict[Contact, Contact]:
     """Contacts that go on as those of a neighbouring feature, which their normals agree with."""
-    lost, new = (
-        [c for c in contacts if c not in other]
-        for contacts, other in ((before, after), (after, before))
-    )
-    return {old: c for old in lost for c in new if takes_over(c, scene, [old])}
+    return {
+        old: new
+        for old, new in product(before, after)
+        if old not in after and new not in before and takes_over(new, scene, [old])
+    }
 
 
 @stored(lambda contact, scene, touching: (contact, scene.shape, touching))

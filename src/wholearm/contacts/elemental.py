@@ -40,7 +40,7 @@ from ..common.sharing import stored
 from ..scene.model import Scene
 
 _Z = ca.SX.sym("z", 5)  # of all scenes: limits that they share outlive the one that built them
-_PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
+_PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(?:(palm)|(finger|tip)([12]))")
 
 
 @dataclass(frozen=True)
@@ -132,32 +132,23 @@ def parse_contact(name: object, scene: Scene) -> Contact:
     )
     if match is None:
         raise InputError("", "", f"{name!r} is not a contact; {allowed}")
-    feature, index, _, finger, tip = match.groups()
-    contact = Contact(
-        feature,
-        int(index),
-        "finger" if finger else "tip" if tip else "palm",
-        int(finger or tip) - 1 if finger or tip else None,
-    )
-    if contact.index >= count or (feature == "e" and not tip):
+    feature, index, palm, part, number = match.groups()
+    contact = Contact(feature, int(index), palm or part, int(number) - 1 if number else None)
+    if contact.index >= count or (feature == "e" and part != "tip"):
         raise InputError("", "", f"{name!r} does not exist; {allowed}")
-    if feature == "v" and tip and scene.fingers[int(tip) - 1].radius == 0:
-        raise InputError(
-            "", "", f"{name!r} needs a rounded tip, but fingers.{tip}.radius is 0; give it a radius"
-        )
+    if (feature, part) == ("v", "tip") and scene.fingers[int(number) - 1].radius == 0:
+        text = f"{name!r} needs a rounded tip, but fingers.{number}.radius is 0; give it a radius"
+        raise InputError("", "", text)
     return contact
 
 
 def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     """Every contact that the object can have with the palm (None) or with one finger."""
-    features = range(scene.polygon.n_vertices)
-    if finger is None:
-        return [Contact("v", i, "palm") for i in features]
-    contacts = [Contact("v", i, "finger", finger) for i in features]
-    contacts += [Contact("e", i, "tip", finger) for i in features]
-    if scene.fingers[finger].radius > 0:
-        contacts += [Contact("v", i, "tip", finger) for i in features]
-    return contacts
+    kinds, count = [("v", "palm")], scene.polygon.n_vertices
+    if finger is not None:
+        rounded = scene.fingers[finger].radius > 0
+        kinds = [("v", "finger"), ("e", "tip"), ("v", "tip")][: 2 + rounded]
+    return [Contact(kind, k, surface, finger) for kind, surface in kinds for k in range(count)]
 
 
 @stored(lambda scene: scene.shape)

@@ -83,8 +83,7 @@ class Formation:
     @cached_property
     def rubbing_rows(self) -> tuple[int, ...]:
         """Which contacts slide with friction: those whose sliding direction matters."""
-        rubs = self.friction > 0
-        return tuple(np.flatnonzero(rubs & ~np.isin(range(len(rubs)), self.rolling_rows)).tolist())
+        return tuple(np.flatnonzero(self.sliding_friction).tolist())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,13 +92,10 @@ class Formation:
 
     def turn_with(self, row: int) -> tuple[int, ...]:
         """Rows of (contacts, joints) that turn as one with a row: a flush edge's, or its own."""
-        if row >= self.n_contacts or self.contacts[row].surface == "tip":
+        sides = [(contact.surface, contact.finger) for contact in self.contacts]
+        if row >= len(sides) or sides[row][0] == "tip":
             return (row,)
-        contact = self.contacts[row]
-        on_side = [
-            (c.surface, c.finger) == (contact.surface, contact.finger) for c in self.contacts
-        ]
-        return tuple(np.flatnonzero(on_side).tolist())
+        return tuple(k for k, side in enumerate(sides) if side == sides[row])
 
     @cached_property
     def friction(self) -> Array:

@@ -223,9 +223,9 @@ def find_vanishing(formation: Formation, z: Array) -> tuple[int, ...]:
 
 def find_rates(formation: Formation, z: Array) -> Array:
     """Rates of (contacts, joints) in each free direction, (n_c + 2, n), over the largest one."""
-    N = tangent_basis(formation, z)
-    slips = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0] / formation.scene.scales.length
-    rates = np.vstack([slips, np.eye(5)[3:]]) @ (N / metric_weights(formation.scene)[:, None])
+    at, metric = formation.evaluate(z[None], np.zeros((1, 5))), metric_weights(formation.scene)
+    rows = np.vstack([at.A_t[0] / formation.scene.scales.length, np.eye(5)[3:]])
+    rates = rows @ find_freedoms(at.P[0], metric, 1e-9)
     return np.asarray(rates / np.linalg.norm(rates, axis=1).max(initial=1e-300))
 
 

@@ -64,15 +64,14 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     places = _list_places(formation, z)
     nearest, least = None, np.inf
     for end in ends:
-        order = np.argsort(end.measure(places))[:24]
-        for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
+        for k in np.argsort(end.measure(places))[:24]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
                 continue
-            distance = float(metric @ (goal - z) ** 2)
+            distance = float(np.sqrt(metric @ (goal - z) ** 2))
             # One that holds at the start is no end to go to.
-            if STILL * formation.scene.scales.length < np.sqrt(distance) < least:
-                nearest, least = goal, np.sqrt(distance)
+            if STILL * formation.scene.scales.length < distance < least:
+                nearest, least = goal, distance
     return nearest
 
 
@@ -156,20 +155,16 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         slip = phase.formation.evaluate_slip(z[None])[0]
         middle = close_contacts(phase.formation, (z + next_end) / 2, slip)
         return next_end if middle is None else middle
-    slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
-    endings = list_ends(phase)
-    for end in endings:
-        goal, reason = _project(end, z, slip)
-        reasons.append(reason)
-        goals += [goal] if goal is not None else []
-    metric = metric_weights(phase.formation.scene)
-
-    if not goals:
-        goal = explore(phase.formation, z, slip, endings)
-        goals = [goal] if goal is not None else []
+    slip, endings = phase.formation.evaluate_slip(z[None])[0], list_ends(phase)
+    projected = [_project(end, z, slip) for end in endings]
+    goals = [goal for goal, _ in projected if goal is not None]
+    if not goals and (goal := explore(phase.formation, z, slip, endings)) is not None:
+        goals = [goal]
     if goals:
+        metric = metric_weights(phase.formation.scene)
         return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
-    raise InputError("", key, f"{phase.until} cannot be reached with these contacts{reasons[0]}")
+    text = f"{phase.until} cannot be reached with these contacts{projected[0][1]}"
+    raise InputError("", key, text)
 
 
 def list_ends(phase: Phase) -> list[Ending]:
@@ -189,17 +184,13 @@ def list_ends(phase: Phase) -> list[Ending]:
 def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     """Nearest end by an active-set method with up to two limits, or what blocks it."""
     formation, active, reason = end.formation, end.active, ""
-    goal = close_contacts(formation, z, slip, end.fixed, active)
-    while goal is not None:
-        limits = formation.evaluate_limits(goal[None])[0]
-        if limits.min() > -formation.scene.touching:
-            return goal, ""
-        worst = int(limits.argmin())
+    for _ in range(3):
+        goal = close_contacts(formation, z, slip, end.fixed, active)
+        if goal is None or is_inside(formation, goal):
+            return goal, reason
+        worst = int(formation.evaluate_limits(goal[None])[0].argmin())
         reason = f": {formation.limits[worst].text} first"
-        if worst in active or len(active) == 2 + len(end.active):
-            break
-        active = (*active, worst)
-        goal = close_contacts(formation, goal, slip, end.fixed, active)
+        z, active = goal, (*active, worst)
     return None, reason
 
 

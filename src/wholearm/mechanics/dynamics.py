@@ -9,13 +9,13 @@ contact forces c = [c_n; c_t(rolling)] are as many as the constraints, n_c + R, 
 
     G = [A - U Xi A_t; A_t(rolling)],  with zero for U Xi of a rolling contact,
 
-are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Where
-nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the equations:
+are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Three
+routes through the equations:
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
   number, the internal force lambda, and the joints' rows then give tau;
-* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.reduced`).
+* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.verify`).
 
 Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
 det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inertia`.
@@ -78,24 +78,16 @@ def stack_motion(a: Array, b: Array, internal: Array) -> Array:
     return np.stack([np.ones_like(b), a, b, np.sqrt(np.maximum(b, 0.0)), internal], axis=-1)
 
 
-def build_forward(formation: Formation) -> Expression:
-    """CasADi function (z, z', tau, Xi, sigma) -> (z'', c, K) of a formation.
-
-    K = P M5^-1 G^T is singular where the formation jams.
-    """
-    scene, n_c = formation.scene, formation.n_contacts
-    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
-    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
-    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
-    inverse_mass = ca.DM(1 / scene.mass_diagonal)
-    G = build_force_rows(formation, P, A_t, Xi)
-    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
-    K = P @ (inverse_mass * G.T)
-    c = ca.solve(K, -P_dot_v - P @ (inverse_mass * applied))
-    acceleration = inverse_mass * (applied + G.T @ c)
-    names = ["z", "v", "tau", "Xi", "sigma"], ["acceleration", "c", "K"]
-    return ca.Function("forward", [z, v, tau, Xi, sigma], [acceleration, c, K], *names)
+def forward(
+    formation: Formation, kinematics: Kinematics, v: Array, tau: Array, directions: Directions
+) -> tuple[Array, Array]:
+    """Accelerations (n, 5) and contact forces (n, n_c + R) at velocities v under torques tau."""
+    scene, G = formation.scene, force_rows(formation, kinematics, directions)
+    over, applied = kinematics.P / scene.mass_diagonal, scene.applied_force - scene.viscous * v
+    applied[:, 3:] += tau - scene.dry[3:] * directions.sigma
+    right = -kinematics.P_dot_v - np.einsum("nij,nj->ni", over, applied)
+    c = np.linalg.solve(over @ G.transpose(0, 2, 1), right[..., None])[..., 0]
+    return (applied + np.einsum("nij,ni->nj", G, c)) / scene.mass_diagonal, c
 
 
 def build_force_rows(

@@ -113,13 +113,6 @@ class LimitSet:
         weights = [(limit.parameter.key == key) * limit.weight for limit in self.limits]
         return np.concatenate(weights)
 
-    @cached_property
-    def columns(self) -> tuple[Array, Array, Array]:
-        """The columns of `rows` that belong to c, tau and theta'."""
-        n_forces = self.rows.shape[1] - 4
-        c, tau, rates = np.split(self.rows, [n_forces, n_forces + 2], axis=1)
-        return c, tau, rates
-
     def find_slack(self, values: Array) -> Array:
         """How far one-sided limits are from being missed, shape (..., n), from rows y, (..., m)."""
         rows, signs, bounds = self.sides

@@ -167,14 +167,12 @@ def find_slack_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array
 
 def find_speed_cap(limits: LimitSet, rates: Array) -> Array:
     """Largest b by limits of joint speeds alone, d theta / ds = `rates`, shape (n,)."""
-    cap = np.full(len(rates), np.inf)
-    for limit in limits.limits:
-        for row, low, high in zip(limit.rows[:, -2:], limit.low, limit.high, strict=True):
-            rate = rates @ row
-            with np.errstate(divide="ignore", invalid="ignore"):
-                largest = (np.where(rate > 0, high, low) / rate) ** 2
-            cap = np.fmin(cap, largest)
-    return cap
+    if not limits.limits:
+        return np.full(len(rates), np.inf)
+    rate = rates @ limits.rows[:, -2:].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        largest = (np.where(rate > 0, limits.high, limits.low) / rate) ** 2
+    return np.asarray(np.fmin.reduce(largest, axis=1, initial=np.inf))
 
 
 class BestInternalForce(NamedTuple):

@@ -30,50 +30,13 @@ CurvePlaces = tuple[Array, Array, Array, Kinematics]
 """z, tangent z_s and curvature z_ss at n places of a curve, (n, 5) each, and kinematics there."""
 
 
-def find_force_slopes(
-    formation: Formation,
-    point: CurvePlaces,
-    directions: Directions,
-    forces: PathForces,
-    names: Sequence[str],
-) -> Array:
-    """Derivatives of contact forces by uncertain numbers, (n, n_c + R, len(names), COUNT).
-
-    They are coefficients of (1, a, b, s', lambda) [N per unit]. Names are of `PARAMETERS`:
-    relative numbers, or lengths in m; `start_x` is the place along the curve.
-    """
-    return _along(formation, point, directions, forces).find_slopes(names)
-
-
-def find_shifts(
-    formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces, name: str
-) -> Array:
-    """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
-    dz, rates = _along(formation, point, directions, forces).displace(name), point[1][:, 3:]
-    square = np.maximum((rates**2).sum(axis=1), 1e-30)
-    return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)
-
-
-def _along(
-    formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces
-) -> _State:
-    """The state of a formation at n places of a curve."""
-    z, z_s, z_ss, kinematics = point
-    acceleration = np.zeros((*z.shape, COUNT))
-    acceleration[..., A], acceleration[..., B] = z_s, z_ss
-    size = np.sqrt(z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
-    along = z_s / size, z_ss / size
-    given = formation, z, z_s, kinematics, directions, *forces[:2]
-    return _State(*given, acceleration, along)
-
-
 def find_slopes_at(
     formation: Formation,
     samples: tuple[Array, Array, Array, Array, Array, Array],
     directions: Directions,
     names: Sequence[str],
 ) -> Array:
-    """The same at n instants of a motion, shape (n, n_c + R, len(names)) [N per unit].
+    """`Sensitivity.find_slopes` at n instants of a motion, (n, n_c + R, len(names)) [N per unit].
 
     `samples` are z, z', z'', tau, c_n and c_t. `start_x` is how far the object is along x, or as
     far as the contacts let it.
@@ -87,14 +50,14 @@ def find_slopes_at(
     unit = np.broadcast_to(np.eye(5)[0], z.shape)
     dz = unit + move_least(kinematics.P, -kinematics.P[..., 0], metric)
     along = dz, np.zeros_like(dz)
-    state = _State(formation, z, v, kinematics, directions, c, tau, acceleration, along)
+    state = Sensitivity(formation, z, v, kinematics, directions, c, tau, acceleration, along)
     state = state._replace(along=(dz, state.turn("", dz)))
     slopes = state.find_slopes(names)
     # The velocity is that of the motion: s' = 1 along a tangent that is z'.
     return np.asarray(slopes @ np.array([1.0, 0.0, 1.0, 1.0, 0.0]))
 
 
-class _State(NamedTuple):
+class Sensitivity(NamedTuple):
     """A formation at n places, with coefficients (..., COUNT) of its motion."""
 
     formation: Formation
@@ -107,8 +70,24 @@ class _State(NamedTuple):
     acceleration: Array
     along: tuple[Array, Array]  # (n, 5): by how much places and tangents change with `start_x`
 
+    @staticmethod
+    def of_curve(
+        formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces
+    ) -> Sensitivity:
+        """At n places of a curve, with coefficients of (1, a, b, s', lambda)."""
+        z, z_s, z_ss, kinematics = point
+        acceleration = np.zeros((*z.shape, COUNT))
+        acceleration[..., A], acceleration[..., B] = z_s, z_ss
+        size = np.sqrt(z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
+        given = formation, z, z_s, kinematics, directions, *forces[:2]
+        return Sensitivity(*given, acceleration, (z_s / size, z_ss / size))
+
     def find_slopes(self, names: Sequence[str]) -> Array:
-        """Derivatives of the contact forces, shape (n, n_c + R, len(names), COUNT)."""
+        """Derivatives of contact forces, shape (n, n_c + R, len(names), COUNT) [N per unit].
+
+        Names are of `PARAMETERS`: relative numbers, or lengths in m; `start_x` is the place along
+        the curve.
+        """
         changes = [self.change(name) for name in names]
         load, bend = (np.stack(columns, axis=2) for columns in zip(*changes, strict=True))
         over = self.kinematics.P / self.formation.scene.mass_diagonal
@@ -116,6 +95,12 @@ class _State(NamedTuple):
         right = bend - np.einsum("nij,njpq->nipq", over, load)
         flat = np.linalg.solve(over @ G.transpose(0, 2, 1), right.reshape(*right.shape[:2], -1))
         return np.asarray(flat.reshape(right.shape))
+
+    def find_shifts(self, name: str) -> Array:
+        """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
+        rates = self.z_s[:, 3:]
+        square = np.maximum((rates**2).sum(axis=1), 1e-30)
+        return np.asarray((self.displace(name)[:, 3:] * rates).sum(axis=1) / square)
 
     def change(self, name: str) -> tuple[Array, Array]:
         """Right sides of the derivative by one number.
@@ -146,38 +131,33 @@ class _State(NamedTuple):
 
     def displace(self, name: str) -> Array:
         """The nearest place where a joint is moved or a link is longer: dz/dp, shape (n, 5)."""
-        step, count = self._step, self.formation.n_contacts
-        here, there = (self._evaluate(name, way * step, self.z) for way in (-1, 1))
+        count, none = self.formation.n_contacts, np.zeros_like(self.z)
         gap = np.zeros(self.kinematics.P.shape[:2])
-        gap[:, :count] = (there.C - here.C) / (2 * step)
+        gap[:, :count] = self._difference(name, none, none).C
         if self.formation.rolling and name.startswith("base"):
             axis = "xy".index(name[-1])
             gap[:, count:] = -(self._rows_of(name) * self.kinematics.P[..., axis])[:, count:]
         return move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
 
-    @property
-    def _step(self) -> float:
-        """Step of the differences of kinematics [m]."""
-        return 1e-5 * self.formation.scene.scales.length
-
-    def _difference(self, name: str, dz: Array) -> Kinematics:
-        """Derivative of the kinematics by a length that is off, where places move with it."""
-        step = self._step
-        ends = [self._evaluate(name, way * step, self.z + way * step * dz) for way in (-1, 1)]
+    def _difference(self, name: str, dz: Array, dz_s: Array) -> Kinematics:
+        """Derivative of the kinematics by a length, with which places and tangents move."""
+        step = 1e-5 * self.formation.scene.scales.length
+        ends = [
+            self._evaluate(name, change, self.z + change * dz, self.z_s + change * dz_s)
+            for change in (-step, step)
+        ]
         return Kinematics(*((b - a) / (2 * step) for a, b in zip(*ends, strict=True)))
 
     def turn(self, name: str, dz: Array) -> Array:
         """By how much the tangent changes."""
-        turned = np.einsum("nij,nj->ni", self._difference(name, dz).P, self.z_s)
+        turned = np.einsum("nij,nj->ni", self._difference(name, dz, 0 * dz).P, self.z_s)
         return move_least(self.kinematics.P, -turned, metric_weights(self.formation.scene))
 
     def _move(self, name: str, dz: Array, dz_s: Array) -> tuple[Array, Array]:
         """What another place and tangent change, with geometry that is off by as much."""
-        slopes = self._difference(name, dz)
-        # P' z' is a quadratic form of the velocity.
-        turns = [self.formation.evaluate(self.z, self.z_s + way * dz_s).P_dot_v for way in (-1, 1)]
+        slopes = self._difference(name, dz, dz_s)
         bend = -np.einsum("nij,njq->niq", slopes.P, self.acceleration)
-        bend[..., B] -= slopes.P_dot_v + (turns[1] - turns[0]) / 2
+        bend[..., B] -= slopes.P_dot_v
         dG = force_rows(self.formation, slopes, self.directions)
         load = np.einsum("nij,niq->njq", dG, self.c)
         load[..., V] -= self.formation.scene.viscous * dz_s
@@ -189,9 +169,9 @@ class _State(NamedTuple):
         contacts = (*self.formation.contacts, *self.formation.rolling)
         return np.array([contact.finger == finger for contact in contacts])
 
-    def _evaluate(self, name: str, change: float, z: Array) -> Kinematics:
-        """The formation at other places, with one length that is off."""
-        formation, v = self.formation, self.z_s
+    def _evaluate(self, name: str, change: float, z: Array, v: Array) -> Kinematics:
+        """The formation at other places and tangents, with one length that is off."""
+        formation = self.formation
         if name.startswith("length"):
             formation = _lengthen(formation, int(name[-1]) - 1, change)
         kinematics = formation.evaluate(z, v)

@@ -207,7 +207,7 @@ def find_ends(
             ends.append(None)
             continue
         goal = place._replace(gained=None) if firm else place
-        hold = find_hold(goal, problem.epsilon, problem.gap, time)
+        hold = find_hold(goal, problem.epsilon, problem.gap)
         ends.append(DwellEnd(place, time, hold, firm))
     return ends
 

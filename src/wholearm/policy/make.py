@@ -39,7 +39,7 @@ from ..mechanics.dynamics import (
 )
 from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits, find_value_rows
-from ..mechanics.sensitivity import find_force_slopes, find_shifts
+from ..mechanics.sensitivity import Sensitivity
 from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
 from ..problem.definition import GROUPS, PARAMETERS, End, Phase, Problem, change_scene
 from ..results.adopt import Moved, adopt_motion
@@ -162,7 +162,7 @@ def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Ar
 def of_forces(limits: LimitSet) -> Array:
     """Derivatives of the slack of limits by contact forces, shape (m, n_c + R)."""
     rows, signs, _ = limits.sides
-    return np.asarray(signs[:, None] * limits.columns[0][rows])
+    return np.asarray(signs[:, None] * limits.rows[rows, :-4])
 
 
 def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
@@ -176,8 +176,8 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         forces = inverse(formation, *point[:3], side, point.kinematics)
         c = respond(forces, torque)[0]
         slack.append(measure_slack(contact, c, torque, rates))
-        slopes = find_force_slopes(formation, point, side, forces, tuple(DOUBTS))
-        changes = np.array([*DOUBTS.values()])[:, None] * slopes
+        state = Sensitivity.of_curve(formation, point, side, forces)
+        changes = np.array([*DOUBTS.values()])[:, None] * state.find_slopes(tuple(DOUBTS))
         delay = respond(forces, late)[0] - c
         changes = np.append(changes, delay[:, :, None], axis=2)
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
@@ -251,12 +251,12 @@ def find_corners(
     nominal = inverse(formation, *point[:3], side, point.kinematics)
     swings = [respond(nominal, late)[0] - respond(nominal, torque)[0]]
     first_order = (*GROUPS["geometry"], *GROUPS["gain"])
+    state = Sensitivity.of_curve(formation, point, side, nominal)
     for name in (other for other in first_order if widths.get(other, 0.0) > 0):
-        slopes = find_force_slopes(formation, point, side, nominal, (name,))[:, :, 0]
+        slopes = state.find_slopes((name,))[:, :, 0]
         if name in GROUPS["geometry"]:
             # Torques depend on the apparent place.
-            shift = find_shifts(formation, point, side, nominal, name)
-            moved = torque + shift[:, None, None] * slope
+            moved = torque + state.find_shifts(name)[:, None, None] * slope
             slopes = slopes + respond(nominal, moved)[0] - respond(nominal, torque)[0]
         swings.append(widths[name] * slopes)
     of_c = of_forces(split_limits(formation)[0])

@@ -20,14 +20,13 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
-from ..common.sharing import Batch
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curves, split_blocks
 from ..mechanics.dynamics import (
     LAMBDA,
     Directions,
     PathForces,
-    build_forward,
+    forward,
     inverse,
     metric_weights,
     stack_motion,
@@ -169,10 +168,9 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         directions = Directions(*np.split(signs, [formation.n_contacts], axis=1))
         samples = plan.at(times)
         z, v = samples.z, samples.z_dot
-        forward = Batch(build_forward(formation))
-        acceleration, _, _ = forward(z, v, plan.torque.at(times), *directions)
         kinematics = formation.evaluate(z, v)
-        forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
+        acceleration, _ = forward(formation, kinematics, v, plan.torque.at(times), directions)
+        forces = inverse(formation, z, v, acceleration, directions, kinematics)
         limits = make_limits(formation, 0.0).without(SPEED)
         weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
         torque = np.isin(limits.sides[0], limits.of(TORQUE))
@@ -185,15 +183,13 @@ def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linea
     """Linearization of a part of a plan at a squared speed `b` over the plan's, by differences."""
     formation, scales, n = part.formation, problem.scene.scales, len(part.z)
     z, v, (_, _, tau) = part.z, part.z_dot * np.sqrt(b), part.scale(b)
-    (Xi, sigma), kinematics = part.directions, formation.evaluate(z, v)
-    forward, step = Batch(build_forward(formation)), 1e-6
+    weights, step = metric_weights(formation.scene), 1e-6
 
     def move(z: Array, v: Array, tau: Array) -> tuple[Array, Array]:
-        acceleration, c, _ = forward(z, v, tau, Xi, sigma)
-        return acceleration[..., 0], c[:, : formation.n_contacts, 0]
+        acceleration, c = forward(formation, formation.evaluate(z, v), v, tau, part.directions)
+        return acceleration, c[:, : formation.n_contacts]
 
-    weights = metric_weights(formation.scene)
-    N = _span(formation, kinematics.P)
+    N = _span(formation, formation.evaluate(z, v).P)
     f = N.shape[2]
     choices = [list(rows) for rows in combinations(range(5), f)]
     rows = max(choices, key=lambda rows: np.abs(np.linalg.det(N[:, rows])).min())
@@ -304,7 +300,7 @@ def tabulate_motion(
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     """Torques that hold all contacts at the end of a phase at rest, or None."""
     place, gap = find_standstill(problem, phase, z), GAP * problem.scene.scales.length
-    hold = find_hold(place, problem.epsilon, gap, 0.02)
+    hold = find_hold(place, problem.epsilon, gap)
     return None if hold is None else hold.tau
 
 

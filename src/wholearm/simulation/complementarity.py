@@ -234,11 +234,8 @@ def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
         if leaving == 2 * n + 1:
             # From the original matrix.
             chosen = basis[basis > n] - n - 1
-            inner, z = M[np.ix_(chosen, chosen)], np.zeros(n)
-            try:
-                z[chosen] = np.linalg.solve(inner, -q[chosen])
-            except np.linalg.LinAlgError:
-                z[chosen] = np.linalg.lstsq(inner, -q[chosen])[0]
+            z = np.zeros(n)
+            z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen], rcond=None)[0]
             w = M @ z + q
             residual = max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w))
             return np.maximum(z, 0.0), float(residual)
@@ -360,17 +357,13 @@ class Pattern:
 
 
 class FreeRun(Run):
-    """A running simulation without prescribed contacts; other arguments are those of `Run`.
+    """A running simulation without prescribed contacts; other arguments are those of `Run`."""
 
-    Attributes
-    ----------
-    resting   whether everything rests
-    unique    whether the present modes were certainly the only solution
-    residual  largest residual of a contact problem so far
-    watched   which pairs do not press, (N,)
-    level     gap at which a pair that touches closes, (N,) [m]
-    """
-
+    resting: bool  # whether everything rests
+    unique: bool  # whether the present modes were certainly the only solution
+    residual: float  # largest residual of a contact problem so far
+    watched: NDArray[np.bool_]  # (N,): which pairs do not press
+    level: Array  # (N,) [m]: gap at which a pair that touches closes
     before: StepEnd
     after: StepEnd
 
@@ -911,5 +904,5 @@ class FreeRun(Run):
 
 
 def _name(system: System, joint: int) -> str:
-    driven = joint in system.driven
-    return f"joint {system.driven.index(joint) + 1}" if driven else f"coordinate {joint + 1}"
+    driven = system.structure.driven
+    return f"joint {driven.index(joint) + 1}" if joint in driven else f"coordinate {joint + 1}"

@@ -16,7 +16,6 @@ from ..common.errors import SimulationError
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Samples, Trajectory, sample_phases
-from .stepper import ModeStepper
 
 
 class EventKind(Enum):
@@ -252,13 +251,6 @@ class Record(NamedTuple):
     c_n: Array  # c_n, c_t: of the kept pairs
     c_t: Array
     impact: float  # [J]: energy lost to impacts so far
-
-    @staticmethod
-    def of(s: ModeStepper, t: float, phase: int, impact: float) -> Record:
-        """What the outputs of some steps say."""
-        out, to, kept = s.outputs.copy(), s.to, s.modes.kept
-        state = out[to.y], out[to.acceleration], out[to.tau]
-        return Record(t, phase, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
 def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:

@@ -5,9 +5,8 @@ joint with theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
-Vertices of a flush edge slide and stick as one. Only the sum T of their c_t is determined, with
-|T| <= sum mu c_n; it is distributed in proportion to c_n, which does not affect the motion. A
-contact flush with a rolling one has no friction of its own.
+Vertices of a flush edge slide and stick as one, with one force T of friction (`stepper`), |T| <=
+sum mu c_n. A contact flush with a rolling one has no friction of its own.
 
 **At rest.** Each choice of signs of sliding and turning, and of what sticks, makes accelerations
 and contact forces affine in the torques. Such a start mode is consistent if contacts and joints
@@ -41,6 +40,7 @@ from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from ..common.arrays import Array, sort_unique
@@ -335,14 +335,10 @@ class Rest:
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
         formation, none = self.formation, np.zeros(self.formation.n_contacts + 2)
-        patterns = list_modes(formation, none, list_units(formation), held)
-        candidates = [
-            (mode, signs)
-            for signs, mode in patterns
-            if (len(mode.holders) > formation.n_rolling) == held
-        ]
-        candidates.sort(key=lambda pattern: len(pattern[0].holders))
-        modes = (self._build(*pattern) for pattern in candidates)
+        every = list_modes(formation, none, list_units(formation), held)
+        patterns = [one for one in every if (len(one[1].holders) > formation.n_rolling) == held]
+        patterns.sort(key=lambda pattern: len(pattern[1].holders))
+        modes = (self._build(mode, signs) for signs, mode in patterns)
         return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
@@ -368,7 +364,7 @@ class Rest:
     def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
         scene, count = self.formation.scene, self.formation.n_contacts
-        rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
+        rows = ContactRows(self.statics.A, self.statics.A_t, *np.zeros((3, count)))
         response = respond(mode, signs, rows, np.zeros(5))
         if response is None:
             return None
@@ -393,7 +389,7 @@ class Rest:
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
-        tau = _evaluate(coefficients, x)
+        tau = polyval(np.asarray(x), coefficients.T)
         for mode in self.list_modes():
             if mode.moves(tau):
                 return mode.depart(x, tau)
@@ -409,7 +405,7 @@ class Rest:
         # Where a margin changes sign; in between, no mode changes.
         polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
         starts, middles = _split(polynomials, x)
-        torques = _evaluate(coefficients, middles)
+        torques = polyval(middles, coefficients.T)
         values = rows[:, :1] + rows[:, 1:] @ torques
         consistent = np.logical_and.reduceat(values >= 0, first, axis=0).T
         for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
@@ -423,7 +419,7 @@ class Rest:
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
-        tau = _evaluate(coefficients, x)
+        tau = polyval(np.asarray(x), coefficients.T)
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.list_modes() if mode.slides(tau)]
@@ -433,9 +429,8 @@ class Rest:
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
             row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(x, self.formation.names[row], least, jams, c_t)
-        return Collapse(
-            x, self.touching.formation.names[int(pulls.argmax())], -float(pulls.max()), jams
-        )
+        row = int(pulls.argmax())
+        return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
@@ -453,12 +448,6 @@ def find_rest(formation: Formation, z: Array) -> Rest:
 def _measure_drive(scene: Scene) -> float:
     """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
     return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
-
-
-def _evaluate(coefficients: Array, x: float | Array) -> Array:
-    """Torques at one place of a piece, shape (2,), or at n places, shape (2, n)."""
-    powers = np.power.outer(np.asarray(x), np.arange(coefficients.shape[1]))
-    return np.asarray(coefficients @ powers.T)
 
 
 def _constant(values: Array, coefficients: Array) -> Array:
@@ -481,7 +470,7 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
 def find_breach(polynomials: Array, x: float) -> float:
     """First place in [x, 1] at which a polynomial of some, (n, d + 1), turns negative; infinity."""
     starts, middles = _split(polynomials, x)
-    low = (_evaluate(polynomials, middles) < 0).any(axis=0)
+    low = (polyval(middles, polynomials.T) < 0).any(axis=0)
     return float(starts[low.argmax()]) if low.any() else np.inf
 
 
@@ -555,25 +544,19 @@ class Hold(NamedTuple):
     parts: tuple[str, ...] = ()
 
 
-def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
+def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
     """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
     A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
-    torques do, or else with that which closes it in `time` [s].
+    torques do.
     """
     rest = _list_holding(place, epsilon)
     best = maximise_margin(place.formation.scene.torque_limit, rest)
     if best is None or best[1] < LEAST:
         return None
-    opening, firm = find_opening(place), Hold(*best)
-    if opening is None:
-        return firm
-    swift = 2 * gap / time**2
-    if closing := _find_closing(place, rest, opening, gap):
-        return closing
-    slow = _find_closing(place, rest, opening, gap, swift)
-    # Torques that close slowly hold less well than those that only hold, but by not too much.
-    return slow if slow is not None and slow.margin > 0.2 * firm.margin else firm
+    opening = find_opening(place)
+    closing = None if opening is None else _find_closing(place, rest, opening, gap)
+    return closing or Hold(*best)
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
@@ -619,18 +602,12 @@ def find_opening(place: Standstill) -> Array | None:
     return np.asarray(N @ push / rate)
 
 
-def _find_closing(
-    place: Standstill, rest: Array, opening: Array, gap: float, ample: float | None = None
-) -> Hold | None:
-    """Torques of largest margin that accelerate the formation towards a contact open by `gap`.
-
-    With a saturation value `ample` [m/s^2] that acceleration is one more margin, not a bound.
-    """
+def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) -> Hold | None:
+    """Torques of largest margin that accelerate the formation towards a contact open by `gap`."""
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
-    scales, limits = scene.scales, scene.torque_limit
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
-    held = Statics(place.formation, z).torque_polygon()
+    scales, held = scene.scales, Statics(place.formation, z).torque_polygon()
     creep = DRIVE * np.repeat(
         [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
     )
@@ -641,11 +618,8 @@ def _find_closing(
             rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
-        if ample is None:
-            bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
-            solution = maximise_margin(limits, rows, bound[None])
-        else:
-            solution = maximise_margin(limits, np.vstack([rows, closing / ample]))
+        enough = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
+        solution = maximise_margin(scene.torque_limit, rows, enough[None])
         if solution is None or solution[1] < max(LEAST, best.margin if best else 0.0):
             continue
         tau, margin = solution

@@ -36,6 +36,7 @@ import numpy as np
 
 from ..common.arrays import Array, find_lowest
 from ..common.errors import JammingError, SimulationError
+from ..common.sharing import bind
 from ..contacts.contact_limits import takes_over
 from ..contacts.elemental import build_features
 from ..contacts.formation import Formation
@@ -45,7 +46,7 @@ from ..results.torque import TorqueProfile
 from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES, bind
+from .stepper import INNER_STAGES, NODES
 from .system import (
     FIRST_STEP,
     REACHED,
@@ -107,7 +108,7 @@ def _build_ends(formation: Formation, until: Until, side: float) -> PhaseEnds:
     parts = *(limit.value for limit in limits), distance, ca.jtimes(distance, features.z, v)
     function = ca.Function("ends", [ca.vertcat(features.z, v)], [ca.densify(ca.vertcat(*parts))])
     state, values = np.zeros(10), np.zeros(len(parts))
-    evaluate, texts = bind(function, [state], values), [limit.text for limit in limits]
+    evaluate, texts = bind(function, [state], [values]), [limit.text for limit in limits]
     unit = 1.0 if until.coordinate == "phi" else scene.scales.length
     return PhaseEnds(evaluate, state, values, texts, unit)
 
@@ -123,31 +124,25 @@ Ending = Stop | Outcome
 
 
 class Replay(Run):
-    """A running simulation with prescribed contacts.
+    """A running simulation with prescribed contacts."""
 
-    Attributes
-    ----------
-    settling, rest_window : [s], rounding : [N]
-                             see the constants of these names
-    slip_signs               signs of contacts, by name, that have just begun to slip
-    ends                     what ends the phase
-    distance, rate           distance to its end [m or rad], and the time derivative of that
-    mode                     what rolls, sticks and is held
-    heading : (5,)           velocity at the start of a step, or the impending one, over its size in
-                             the metric M5
-    passes                   whether the end may be passed at any speed, without an impact
-    moving                   whether the motion goes on into the next phase
-    stuck                    contacts, then joints, that stick while the rest moves
-    minima                   whether to record where margins are least within steps, too
-    least                    c_n of contacts up to now in the phase, over the scene's force
-    """
-
-    ends: PhaseEnds
-    mode: modes.Mode
-    heading: Array
+    minima: bool  # whether to record where margins are least within steps, too
+    settling: float  # settling, rest_window [s], rounding [N]: see the constants of these names
+    rest_window: float
+    rounding: float
     phase: Phase
     following: Phase | None  # the next phase
-    least: Array
+    ends: PhaseEnds  # what ends the phase
+    distance: float  # to its end [m or rad]
+    rate: float  # time derivative of that
+    passes: bool  # whether the end may be passed at any speed, without an impact
+    moving: bool  # whether the motion goes on into the next phase
+    mode: modes.Mode  # what rolls, sticks and is held
+    # (5,): velocity at the start of a step, or the impending one, over its size in the metric M5
+    heading: Array
+    stuck: set[int]  # contacts, then joints, that stick while the rest moves
+    slip_signs: dict[str, float]  # of contacts that have just begun to slip
+    least: Array  # (n_c,): c_n up to now in the phase, over the scene's force
     releasable: tuple[str, ...]  # the contacts whose release ends the phase
     # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
     # the phase ends
@@ -166,8 +161,7 @@ class Replay(Run):
         self.held_until = self.settled_by = -math.inf
         self.distance = self.rate = 0.0
         self.passes = self.moving = False
-        self.stuck: set[int] = set()
-        self.slip_signs: dict[str, float] = {}
+        self.stuck, self.slip_signs = set(), {}
 
     @property
     def formation(self) -> Formation:
@@ -445,7 +439,7 @@ class Replay(Run):
         records, shown = list[Record](), math.inf
         for x in sorted(lowest):
             self.step_to(x * h)
-            records.append(Record.of(s, self.t + x * h, self.phase_index, self.impact))
+            records.append(self.read_outputs(self.t + x * h))
             self.least = np.minimum(self.least, self.values[force])
             if (self.values + self.slack < 0).any():
                 shown = min(shown, x * h)
@@ -612,14 +606,12 @@ class Replay(Run):
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
-        names, kept = formation.names, following.formation.names
-        rolled, rolls = ({c.name for c in p.formation.rolling} for p in (phase, following))
-        self.releasable = tuple(name for name in names if name not in kept)
+        contacts, kept = formation.contacts, set(following.formation.contacts)
+        rolled, rolls = (set(each.formation.rolling) for each in (phase, following))
+        self.releasable = tuple(c.name for c in contacts if c not in kept)
         if not self.releasable:
-            self.resting = frozenset(k for k, name in enumerate(names) if name in rolls - rolled)
-        self.slipping = frozenset(
-            k for k, name in enumerate(names) if name in rolled - rolls and name in kept
-        )
+            self.resting = frozenset(k for k, c in enumerate(contacts) if c in rolls - rolled)
+        self.slipping = frozenset(k for k, c in enumerate(contacts) if c in (rolled - rolls) & kept)
 
     def _close(self, formation: Formation) -> Array:
         """The present configuration with every contact of a formation closed."""
@@ -690,11 +682,9 @@ class Replay(Run):
         if self._decide(turned, enters):
             return self.come_to_rest()
         self.observe()
-        if self._bridge(SETTLING):
-            return self.come_to_rest()
+        ended, c_n = self._bridge(SETTLING), self.s.outputs[self.s.to.c_n]
         # By more than rounding: phase 5 of leg 59 of seed 1128.
-        short = self.s.outputs[self.s.to.c_n] < 0.99 * self.problem.epsilon
-        if short.any() and self._bridge(BRIDGED):
+        if ended or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(BRIDGED)):
             return self.come_to_rest()
         self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:

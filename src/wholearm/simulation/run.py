@@ -25,30 +25,23 @@ class StuckError(ArithmeticError):
 
 
 class Run(ABC):
-    """A running simulation; the rule that decides on contacts is that of the class.
+    """A running simulation; the rule that decides on contacts is that of the class."""
 
-    Attributes
-    ----------
-    t, h : [s]           present time, and the step to try next
-    y : (2 n + LOSSES,)  z, z', then work, viscous, dry and contact losses
-    s                    steps of the present modes
-    piece                of the torques, which the present time belongs to
-    steps_at             whether the torques step at the start of each piece
-    impact : [J]         energy lost to impacts so far
-    wanted : [s]         instants at which steps have to end; infinity is last
-    values, start        event values after the step just made and before it, in units of the scene:
-                         an event is where one falls below zero
-    slack                how far below zero each of them counts as rounding
-    longest : [s]        longest step from the present state
-    """
-
-    s: ModeStepper
-    t: float
+    t: float  # t, h [s]: present time, and the step to try next
+    h: float
+    y: Array  # (2 n + LOSSES,): z, z', then work, viscous, dry and contact losses
     modes: Modes
+    s: ModeStepper  # steps of the present modes
+    piece: int  # of the torques, which the present time belongs to
+    steps_at: list[bool]  # whether the torques step at the start of each piece
+    impact: float  # [J]: energy lost to impacts so far
+    wanted: list[float]  # [s]: instants at which steps have to end; infinity is last
+    # values, start: event values after the step just made and before it, in units of the scene: an
+    # event is where one falls below zero
     values: Array
     start: Array
-    slack: Array
-    longest = math.inf
+    slack: Array  # how far below zero each of them counts as rounding
+    longest = math.inf  # [s]: longest step from the present state
 
     def __init__(
         self,
@@ -57,23 +50,22 @@ class Run(ABC):
         z: Array,
         v: Array,
         tolerance: float = 1e-9,
-        wanted: Array | None = None,
+        wanted: Sequence[float] | Array = (),
     ) -> None:
         self.feedback = torque if isinstance(torque, Feedback) else None
         torque = torque.torque if isinstance(torque, Feedback) else torque
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
-        self.steps_at: list[bool] = [True, *self.find_torque_steps(torque).tolist()]
+        self.steps_at = [True, *self.find_torque_steps(torque).tolist()]
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
         self.phase_index = self.steps = self.rejected = 0
         self.records: list[Record] = []
         self.events: list[Event] = []
-        wanted = np.zeros(0) if wanted is None else wanted
-        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted, self.next_wanted = [*within.tolist(), math.inf], 0
+        within = (t for t in wanted if self.breaks[0] <= t <= self.breaks[-1])
+        self.wanted, self.next_wanted = [*map(float, within), math.inf], 0
         self.residual = 0.0
         self.sample()
         self.decisions, self.decided_at = 0, -math.inf
@@ -203,7 +195,7 @@ class Run(ABC):
         """Sample the feedback law, if there is one, at the start of a piece of the torques."""
         if self.feedback is None:
             return
-        theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
+        theta, theta_dot = (part[list(self.system.structure.driven)] for part in (self.z, self.v))
         forces = {}
         if self.records:
             last = self.records[-1]
@@ -343,14 +335,18 @@ class Run(ABC):
 
         At rest accelerations are zero, and forces are NaN, as they are indeterminate.
         """
-        here = self.t, self.phase_index
-        if still:
-            kept, n = self.modes.kept, self.system.n
-            none, tau = np.full(len(kept), math.nan), self.tau(self.t)
-            record = Record(*here, kept, self.y.copy(), np.zeros(n), tau, none, none, self.impact)
-        else:
-            record = Record.of(self.s, *here, self.impact)
-        self.records.append(record)
+        if not still:
+            self.records.append(self.read_outputs(self.t))
+            return
+        none, tau = np.full(len(self.modes.kept), math.nan), self.tau(self.t)
+        seen = self.y.copy(), np.zeros(self.system.n), tau, none, none
+        self.records.append(Record(self.t, self.phase_index, self.modes.kept, *seen, self.impact))
+
+    def read_outputs(self, t: float) -> Record:
+        """The outputs of the steps as a record at time `t` [s]."""
+        out, to, here = self.s.outputs.copy(), self.s.to, (t, self.phase_index, self.modes.kept)
+        state = out[to.y], out[to.acceleration], out[to.tau]
+        return Record(*here, *state, out[to.c_n], out[to.c_t], self.impact)
 
 
 @runtime_checkable

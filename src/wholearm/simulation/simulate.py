@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from itertools import groupby, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -212,14 +212,10 @@ def _conclude(
         # Of two rows at a boundary the first one ends the phase before.
         twice = np.append(np.diff(t) == 0, False) & np.isin(t, clock[1:])
         phase = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
-    forces, first = np.full((2, len(records), len(contacts)), np.nan), 0
-    for kept, group in groupby(records, lambda row: row.kept):
-        values = np.array([(row.c_n, row.c_t) for row in group])
-        for k, pair in enumerate(kept):
-            if names[pair] in contacts:
-                column = contacts.index(names[pair])
-                forces[:, first : first + len(values), column] = values[:, :, k].T
-        first += len(values)
+    forces = np.full((2, len(records), len(names)), np.nan)
+    for index, row in enumerate(records):
+        forces[:, index, list(row.kept)] = row.c_n, row.c_t
+    c_n, c_t = forces[:, :, [names.index(name) for name in contacts]]
     z, z_dot = y[:, :n], y[:, n : 2 * n]
     work, viscous, dry, contact = y[:, 2 * n :].T
     return Simulation(
@@ -230,8 +226,8 @@ def _conclude(
         tau=tau,
         phase=phase,
         contacts=tuple(contacts),
-        c_n=forces[0],
-        c_t=forces[1],
+        c_n=c_n,
+        c_t=c_t,
         energies=Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact),
         problem=problem,
         torque=run.torque,

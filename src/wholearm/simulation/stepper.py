@@ -17,7 +17,7 @@ edition, section II.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
+from ..common.sharing import bind
 from .system import Structure, System
 
 LOSSES = 4  # integrals along the motion: work, losses to viscous, dry and sliding friction
@@ -55,10 +56,7 @@ ROWS: tuple[dict[int, float], ...] = (
      10: 0.6433927460157636},
 )
 """Weights of the stages before, for each stage."""
-NODES = (
-    0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
-    0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
-)
+NODES = tuple(sum(row.values()) for row in ROWS)
 """Times of the stages, as shares of a step."""
 INNER_STAGES = (3, 5, 9, 10)  # stages spread over the step that approximate the state well
 WEIGHTS = {
@@ -82,9 +80,8 @@ class Modes(NamedTuple):
     """What keeps which contacts while a motion is smooth."""
 
     kept: tuple[int, ...] = ()  # pairs that press
-    stuck: tuple[
-        tuple[int, ...], ...
-    ] = ()  # those of them that stick, each with what sticks as one
+    # those of them that stick, each with what sticks as one
+    stuck: tuple[tuple[int, ...], ...] = ()
     held: tuple[int, ...] = ()  # coordinates that dry friction holds
     Xi: tuple[float, ...] = ()  # sliding directions of the kept pairs, zero where they stick
     # directions of coordinates with dry friction, zero for those that are held
@@ -168,7 +165,7 @@ class ModeStepper:
         inputs[at.units] = system.units
         inputs[at.scales] = system.scales.force, system.scales.speed
         inputs[at.friction_units] = system.friction_units
-        slip = system.evaluate_slip(z, [pairs[0] for pairs in self.modes.stuck])
+        slip = system.evaluate(z, z, [pairs[0] for pairs in self.modes.stuck]).slip
         inputs[at.stay] = np.concatenate([slip, z[list(self.modes.held)]])
 
 
@@ -221,7 +218,7 @@ class _Equations:
             outputs = ca.densify(ca.vertcat(state, parts, *extra))
             functions.append(ca.Function("step", [packed], [outputs]))
         inputs, outputs = np.zeros(at.size), np.zeros(self.to.size)
-        step, look = (bind(function, [inputs], outputs) for function in functions)
+        step, look = (bind(function, [inputs], [outputs]) for function in functions)
         return ModeStepper(self.modes, inputs, outputs, at, self.to, self.rows, step, look)
 
     def _stack(self, normal: Expression, tangential: Expression) -> Expression:
@@ -313,16 +310,6 @@ def _build_correction(count: int, n: int) -> Expression:
     P, r, lift = ca.SX.sym("P", count, n), ca.SX.sym("r", count), ca.SX.sym("lift", n)
     lifted = ca.repmat(lift, 1, count) * P.T
     return ca.Function("correct", [P, r, lift], [ca.densify(lifted @ ca.solve(P @ lifted, r))])
-
-
-def bind(function: Expression, inputs: Sequence[Array], outputs: Array) -> Any:
-    """A call of a CasADi function of dense arrays, which stay in place and live as long."""
-    buffer, call = function.buffer()
-    for k, values in enumerate(inputs):
-        buffer.set_arg(k, values.data)
-    buffer.set_res(0, outputs.data)
-    call.kept = buffer, inputs, outputs
-    return call
 
 
 def _build_torque(time: Expression, piece: Expression, coefficients: Expression) -> Expression:

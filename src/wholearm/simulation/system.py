@@ -46,6 +46,7 @@ class ContactRows(NamedTuple):
     A_t: Array
     bend: Array  # bend, bend_t (m,): A' z' and A_t' z'
     bend_t: Array
+    slip: Array  # (m,) [m]: slip coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +121,6 @@ class System:
         """Names of all pairs."""
         return self.structure.names
 
-    @property
-    def driven(self) -> tuple[int, ...]:
-        """Coordinates that the two torques act on."""
-        return self.structure.driven
-
     @cached_property
     def units(self) -> Array:
         """Units of z, then of z', shape (2 n,)."""
@@ -142,17 +138,10 @@ class System:
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> ContactRows:
         """Rows of some pairs at one state."""
-        n, rows = self.n, self._evaluate(z, v, chosen)
-        return ContactRows(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1])
-
-    def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
-        """Slip coordinates of some pairs, shape (m,) [m]."""
-        return self._evaluate(z, z, chosen)[:, -1]
-
-    def _evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Array:
-        if not len(chosen):
-            return np.zeros((0, 2 * self.n + 3))
-        return _build_rows(self.structure, tuple(chosen)).at(z, v, self.geometry)[0]
+        n, rows = self.n, np.zeros((0, 2 * self.n + 3))
+        if len(chosen):
+            rows = _build_rows(self.structure, tuple(chosen)).at(z, v, self.geometry)[0]
+        return ContactRows(rows[:, :n], rows[:, n : 2 * n], *rows[:, 2 * n :].T)
 
     def look(self, z: Array) -> tuple[Array, Array]:
         """As `measure`, at one place: shape (N,) each [m]."""
@@ -172,7 +161,8 @@ class System:
     def push(self, v: Array, tau: Array, sigma: Array) -> Array:
         """Forces on z but those of contacts, with dry friction in the directions `sigma`, (n,)."""
         force = self.applied - self.viscous * v - self.dry * sigma
-        force[list(self.driven)] += tau[: len(self.driven)]
+        driven = list(self.structure.driven)
+        force[driven] += tau[: len(driven)]
         return force
 
 

@@ -26,7 +26,7 @@ from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
-from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
+from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
 from .verdict import DEPARTURE, measure_departure
@@ -184,14 +184,14 @@ def find_policy(
     return usual
 
 
-def warn(title: str, simulation: FreeSimulation) -> list[str]:
+def warn(title: str, simulation: Simulation) -> list[str]:
     """What was not decided by the laws of contact alone."""
     told = EventKind.AMBIGUOUS, EventKind.INCONSISTENT
     return [f"{title}: {event.text}" for event in simulation.events if event.kind in told]
 
 
 def _compare(
-    plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
+    plan: Trajectory, simulation: Simulation, indices: range, allowed: float
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
     compared, starts = [], plan.phase_starts.tolist()
@@ -203,14 +203,14 @@ def _compare(
     return compared
 
 
-def measure_end(simulation: FreeSimulation, plan: Trajectory, index: int, stop: float) -> Deviation:
+def measure_end(simulation: Simulation, plan: Trajectory, index: int, stop: float) -> Deviation:
     """Difference of the configuration at an instant from the planned end of a phase."""
     row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
     away = np.abs(simulation.z[row] - plan.z[np.flatnonzero(plan.phase == index)[-1]])
     return Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
 
 
-def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
+def _follow(simulation: Simulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
     """Phases of torques alone: each until what ends it has happened."""
     problem, phases = simulation.problem, list[FreePhase]()
     failures: list[str] = []
@@ -234,7 +234,7 @@ def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase
 
 
 def _find_end(
-    simulation: FreeSimulation, phase: Phase, after: Phase | None, start: float
+    simulation: Simulation, phase: Phase, after: Phase | None, start: float
 ) -> float | None:
     """When a phase ends, None if it does not [s]."""
     until, rows = phase.until, np.flatnonzero(simulation.t >= start)
@@ -264,7 +264,7 @@ def list_gained(problem: Problem, phase: Phase) -> set[str]:
     return (new | gained).difference(phase.formation.names, *list_aliases(problem, phase).values())
 
 
-def find_touch(simulation: FreeSimulation, contacts: Collection[str], start: float) -> float:
+def find_touch(simulation: Simulation, contacts: Collection[str], start: float) -> float:
     """When one of some contacts first touches after `start`, if only to bounce; infinity if none.
 
     An impact may lift other contacts, before the one that strikes presses for good.
@@ -299,7 +299,7 @@ def list_aliases(problem: Problem, phase: Phase) -> dict[str, set[str]]:
 
 
 def find_losses(
-    simulation: FreeSimulation,
+    simulation: Simulation,
     phase: Phase,
     start: float,
     stop: float,
@@ -355,7 +355,7 @@ class FreeReport(Result):
     """What a simulation without assumptions showed."""
 
     name: str  # the problem's
-    whole: FreeSimulation = field(repr=False)  # from the exact start to the end of the torques
+    whole: Simulation = field(repr=False)  # from the exact start to the end of the torques
     # phases of a plan, each from its planned start; empty for torques alone
     alone: tuple[FreePhase, ...]
     phases: tuple[FreePhase, ...]  # of the whole: by the clock of a plan, or by what happens

@@ -132,9 +132,8 @@ def balance(
 
 def place_object(scene: Scene, z: Array) -> Array:
     """World positions of the vertices at n configurations, shape (n, n_v, 2) [m]."""
-    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
-    turn = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
-    return np.asarray(z[:, None, :2] + scene.polygon.vertices @ turn.transpose(0, 2, 1))
+    turn = np.cos(z[:, 2]), np.sin(z[:, 2])
+    return z[:, None, :2] + np.stack([_rotate(v, *turn) for v in scene.polygon.vertices], axis=1)
 
 
 def link_axis(scene: Scene, z: Array, finger: int) -> Array:

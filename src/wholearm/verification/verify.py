@@ -217,7 +217,6 @@ def _report_phase(
     ends = EventKind.ARRIVAL, EventKind.RELEASE
     arrivals = [e for e in simulation.events if e.phase == index and e.kind in ends]
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
-    stops = bool(arrivals) and phase.end is End.REST
     formation, until = phase.formation, str(phase.until)
     if arrivals and phase.until.is_release:
         what = "release" if arrivals[0].kind is EventKind.RELEASE else "change"
@@ -229,33 +228,31 @@ def _report_phase(
     names = [formation.names[row] for row in formation.rolling_rows]
     margins = dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
     slips = _find_least(simulation, index, margins, EventKind.SLIP)
-    end = worst = held = None
+    end = worst = held = least = None
     if uniqueness:
         # Since the last break of the torques before it starts to move, if it does.
         starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
         breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
         since = max(breaks, default=-math.inf)
         held = verdict.find_wedged(problem, phase, simulation, rows, verdict.REST_SPEED, since)
+        least = verdict.find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
         end, worst = _compare(simulation, plan, phase, bool(arrivals))
+    last_speed = verdict.measure_speed(problem.scene, simulation.z_dot[rows[-1]])
     return results.PhaseReport(
         number=phase.number,
         until=until,
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
         contacts=tuple(results.ContactMargin(*one, one[1] - problem.epsilon) for one in pressing),
-        rolling=tuple(results.SlipMargin(*least) for least in slips),
+        rolling=tuple(results.SlipMargin(*slip) for slip in slips),
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
-        end_speed=verdict.measure_speed(problem.scene, simulation.z_dot[rows[-1]])
-        if stops
-        else None,
+        end_speed=last_speed if arrivals and phase.end is End.REST else None,
         impact=results.LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
-        uniqueness_margin=verdict.find_uniqueness_margin(phase, simulation, rows)
-        if uniqueness
-        else None,
+        uniqueness_margin=least,
         wedged=held,
     )
 
@@ -665,12 +662,9 @@ def find_resting_changes(
 def find_sides(limits: LimitSet, response: modes.Response, v: Array) -> Array:
     """Slack of one-sided limits at velocity v, (5,), rows @ (1, tau_1, tau_2), (n_sides, 3)."""
     formation = response.mode.formation
-    of_c, of_tau, of_rates = limits.columns
-    rolling = response.c_t[list(formation.rolling_rows)]
-    values = of_c @ np.vstack([response.c[: formation.n_contacts], rolling])
-    values[:, 1:] += of_tau
-    values[:, 0] += of_rates @ v[3:]
-    return limits.find_slack_rows(values)
+    forces = response.c[: formation.n_contacts], response.c_t[list(formation.rolling_rows)]
+    y = np.vstack([*forces, np.eye(3)[1:], np.column_stack([v[3:], np.zeros((2, 2))])])
+    return limits.find_slack_rows(limits.rows @ y)
 
 
 def find_moving(

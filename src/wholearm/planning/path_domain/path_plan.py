@@ -612,14 +612,15 @@ class LimitShape(NamedTuple):
         """The shape of the limits of phases and of their motors."""
         limits, scene = data.limits, data.curve.formation.scene
         rows, signs, _ = limits.sides
-        of_tau, of_rates = (part.any(axis=1) for part in limits.columns[1:])
+        # What depends on torques or speeds of the joints.
+        joints = limits.rows[:, -4:].any(axis=1)
         drags = np.array([limits.limits[k].drags for k in limits.owners])
         return LimitShape(
             len(limits.low),
             tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
-            tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
+            tuple(np.flatnonzero(joints | drags).tolist()),
             tuple(np.flatnonzero(np.isfinite(scene.torque_rate_limit)).tolist()),
             tuple(np.flatnonzero(scene.actuator_lag).tolist()),
         )
@@ -715,7 +716,7 @@ class Units(NamedTuple):
 
     def of(self, limits: LimitSet) -> Array:
         """Units of each row of limits, shape (m,)."""
-        of_torque = np.abs(limits.columns[1])
+        of_torque = np.abs(limits.rows[:, -4:-2])
         return np.where(of_torque.any(axis=1), of_torque @ self.torque, self.force)
 
 

@@ -29,7 +29,7 @@ from ...geometry.curve import Curve, CurvePoint, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
-from ...mechanics.sensitivity import find_force_slopes
+from ...mechanics.sensitivity import Sensitivity
 from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.definition import PARAMETERS, change_scene
 
@@ -70,7 +70,8 @@ class RobustLimits(NamedTuple):
         epsilon: float,
     ) -> Array:
         """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
-        slopes = find_force_slopes(formation, point, directions, forces, self.names)
+        state = Sensitivity.of_curve(formation, point, directions, forces)
+        slopes = state.find_slopes(self.names)
         variations = np.einsum("mi,nipq->nmpq", self.rows, slopes)
         for k, name in enumerate(self.names):
             edges = find_edges(formation, self.rows, name)

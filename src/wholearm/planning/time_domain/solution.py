@@ -608,8 +608,7 @@ def find_misses(
     values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
     values[:, limits.of(PRESS)] -= margin
     slack = limits.find_slack(values) / limits.side_scales
-    of_c, _, of_rates = limits.columns
-    bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
+    bent = np.flatnonzero(np.delete(limits.rows, [-4, -3], axis=1).any(axis=1))
     slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
     relieved = np.repeat(find_relieved(stage, limits), SETTINGS.checks, axis=0)
     # Misses at the start of a stage do not depend on it.

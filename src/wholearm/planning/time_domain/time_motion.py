@@ -11,28 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.sharing import Batch, stored
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
-from ...mechanics.dynamics import (
-    Directions,
-    build_forward,
-    metric_weights,
-    move_least,
-    split_forces,
-)
+from ...mechanics.dynamics import Directions, forward, metric_weights, move_least, split_forces
 from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .stage import Scheme, Stage, StagePoints, blend
 
 _NODES = 8  # places per interval at which the equations of motion are solved
-
-
-@stored(lambda formation: formation.equations)
-def _compile_forward(formation: Formation) -> Batch:
-    """Forward dynamics of a formation."""
-    return Batch(build_forward(formation))
 
 
 class MotionResponse(NamedTuple):
@@ -98,7 +85,6 @@ class StageMotion:
         torque = self.torque.coefficients
         tau = np.einsum("kjd,nd->knj", torque, powers[:, : torque.shape[2]])
         count = len(half)
-        signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
         a = np.zeros((count, 5, _NODES))
         a[..., : len(self.scheme.points)] = _fit(2 * self.scheme.points - 1, self.points.a)
         weights = np.sqrt(metric_weights(self.formation.scene))[:, None]
@@ -106,12 +92,13 @@ class StageMotion:
         for _ in range(6):  # times that accelerations are improved. Each gains one to two digits.
             velocity = _integrate(a, half, v[:-1])
             place = _integrate(velocity, half, z[:-1])
-            state = (
+            here, rate = (
                 np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
                 for part in (place, velocity)
             )
-            forces = _compile_forward(self.formation)(*state, tau.reshape(-1, 2), *signs)
-            accelerations = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+            at = self.formation.evaluate(here, rate)
+            z_ddot, _ = forward(self.formation, at, rate, tau.reshape(-1, 2), self.directions)
+            accelerations = _fit(x, z_ddot.reshape(count, _NODES, 5))
             residual = np.abs(weights * (accelerations - a)).max(axis=(1, 2), keepdims=True)
             nearer = residual < least
             kept, least = np.where(nearer, a, kept), np.where(nearer, residual, 0.0)
@@ -147,22 +134,18 @@ class StageMotion:
         kinematics = formation.evaluate(z, v)
         v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
-        Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
-        a, c, _ = _compile_forward(self.formation)(z, v, tau, Xi, sigma)
-        c_n, c_t = split_forces(formation, c[..., 0], Xi)
-        return Samples(z, v, a[..., 0], tau, c_n, c_t)
+        a, c = forward(formation, formation.evaluate(z, v), v, tau, self.directions)
+        return Samples(z, v, a, tau, *split_forces(formation, c, self.directions.Xi))
 
     def respond(self, t: Array) -> MotionResponse:
         """State, forces and accelerations at times `t`, and how these change with torques."""
-        at = self.evaluate(t)
-        signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
+        at, formation = self.evaluate(t), self.formation
+        kinematics = formation.evaluate(at.z, at.z_dot)
         responses = [
-            _compile_forward(self.formation)(at.z, at.z_dot, at.tau + step, *signs)[:2]
+            forward(formation, kinematics, at.z_dot, at.tau + step, self.directions)
             for step in (np.zeros(2), *np.eye(2))
         ]
-        a, c = (
-            np.stack([response[k][..., 0] for response in responses], axis=-1) for k in range(2)
-        )
+        a, c = (np.stack(parts, axis=-1) for parts in zip(*responses, strict=True))
         y = np.hstack([c[..., 0], at.tau, at.z_dot[:, 3:]])
         by_torque = np.zeros((*y.shape, 2))
         by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
