@@ -31,10 +31,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from ..common.arrays import Array, Expression
+from ..common.arrays import Array, Expression, Numbers
 from ..common.document import Table
 from ..common.errors import InputError
 from ..contacts.formation import Formation
@@ -416,7 +415,7 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
     return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
 
 
-def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> PathLimits:
+def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
     """Limits at places of a curve, whose segments are `owner`."""
     curve, point = instance.curve, instance.curve.evaluate(s)
     forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))

@@ -31,12 +31,11 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_array, kron
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Flags
 from ..common.errors import InputError, WholearmError
 from ..contacts.formation import Formation
 from ..mechanics import UNIQUENESS
@@ -377,7 +376,6 @@ def maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> floa
 
 PLACES = 60  # places along a curve at which limits are looked at
 CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
-Flags = NDArray[np.bool_]
 
 
 class Verdict(NamedTuple):

@@ -15,9 +15,8 @@ from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, Flags, Numbers, find_runs
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
 from ..policy.playback import ClosedLoop, Policy
@@ -282,9 +281,7 @@ def compare(
     return Departure(run.t, position, angle, tuple(forces), time, reason)
 
 
-def _average(
-    phase: Phase, motion: Motion, t: Array, rows: NDArray[np.int64], run: EngineRun
-) -> list[Force]:
+def _average(phase: Phase, motion: Motion, t: Array, rows: Numbers, run: EngineRun) -> list[Force]:
     """Planned and found normal forces of a phase, averaged until the gained contact closes.
 
     Its gap closes at a vanishing speed: a small error of the pose closes it early. `t` are the
@@ -303,11 +300,11 @@ def _average(
 
 
 def _list_changes(
-    phase: Phase, want: Samples, rows: NDArray[np.int64], run: EngineRun, reach: float
+    phase: Phase, want: Samples, rows: Numbers, run: EngineRun, reach: float
 ) -> Iterator[tuple[float, float, str]]:
     """Deviations of contacts from the plan in a phase: their intervals [s], and in words."""
     formation, scales = phase.formation, phase.formation.scene.scales
-    flags = list[tuple[str, NDArray[np.bool_], Array]]()
+    flags = list[tuple[str, Flags, Array]]()
     t, moves = run.t[rows], 2e-3 * scales.speed
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
     planned = formation.evaluate(want.z, want.z_dot)

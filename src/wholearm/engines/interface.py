@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Independent, sort_unique
+from ..common.arrays import Array, Independent, Numbers, sort_unique
 from ..common.errors import InputError, WholearmError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
@@ -186,7 +186,7 @@ class EngineRun(NamedTuple):
         """Numbers of the pairs that are one contact."""
         return [self.pairs.index(name) for name in find_pairs(contact, scene.polygon.n_vertices)]
 
-    def cut(self, rows: NDArray[np.int64], gained: Contact | None, scene: Scene) -> NDArray[Any]:
+    def cut(self, rows: Numbers, gained: Contact | None, scene: Scene) -> NDArray[Any]:
         """Rows of a phase up to the first force of the contact that it gains."""
         if gained is None:
             return rows

@@ -14,9 +14,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, find_root
+from ..common.arrays import Array, Numbers, find_root
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, find_freedoms, metric_weights
 
@@ -171,7 +170,7 @@ class Curve:
         return tuple(segments)
 
 
-def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
+def directions_of(curve: Curve, segment: Numbers) -> Directions:
     """Directions at n places of a curve, given the segment that each belongs to."""
     signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
     return Directions(*(np.array(sign)[segment] for sign in signs))

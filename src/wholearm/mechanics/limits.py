@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.errors import Parameter
 from ..contacts.formation import Formation
 
@@ -65,7 +64,7 @@ class LimitSet:
         return np.concatenate([limit.high for limit in self.limits])
 
     @cached_property
-    def owners(self) -> NDArray[np.int64]:
+    def owners(self) -> Numbers:
         """Which limit each row belongs to, shape (m,)."""
         return np.repeat(np.arange(len(self.limits)), [len(limit.low) for limit in self.limits])
 
@@ -75,7 +74,7 @@ class LimitSet:
         return np.array([self.limits[k].scale for k in self.owners])
 
     @cached_property
-    def sides(self) -> tuple[NDArray[np.int64], Array, Array]:
+    def sides(self) -> tuple[Numbers, Array, Array]:
         """Rows, signs, bounds (n,) of one-sided limits, sign (row y - bound) >= 0; lower first."""
         lows, highs = (np.flatnonzero(np.isfinite(bound)) for bound in (self.low, self.high))
         signs = np.repeat([1.0, -1.0], [len(lows), len(highs)])
@@ -87,7 +86,7 @@ class LimitSet:
         """Units of the shortfalls of one-sided limits, shape (n,)."""
         return np.asarray(self.scales[self.sides[0]])
 
-    def of(self, *kinds: str) -> NDArray[np.int64]:
+    def of(self, *kinds: str) -> Numbers:
         """Rows of the limits of some kinds."""
         return np.flatnonzero([self.limits[k].kind in kinds for k in self.owners])
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Flags, Numbers
 from ..contacts.formation import Formation
 from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
 from .limits import EPSILON, PRESS, LimitSet, make_limits
@@ -26,7 +25,7 @@ class Extreme(NamedTuple):
 
     a: Array
     slope: Array
-    row: NDArray[np.int64]
+    row: Numbers
 
 
 class PathLimits(NamedTuple):
@@ -84,14 +83,14 @@ class PathLimits(NamedTuple):
         rows[..., ONE] = np.where(used, rows[..., ONE], 1.0)
         return self._replace(rows=rows)
 
-    def pair(self, row: NDArray[np.int64]) -> NDArray[np.int64]:
+    def pair(self, row: Numbers) -> Numbers:
         """The two rows that a row of `eliminate` combines, (..., 2); itself without lambda."""
         first, second = np.triu_indices(self.rows.shape[-2], 1)
         if not self.rows[..., LAMBDA].any():
             return np.stack([row, row], axis=-1)
         return np.stack([first[row], second[row]], axis=-1)
 
-    def meet(self, b: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
+    def meet(self, b: Array, pairs: Numbers) -> tuple[Array, Array]:
         """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have no slack."""
         k = np.arange(len(b))[:, None]
         (r1, r2), (l1, l2) = (self.rows[k, pairs, column].T for column in (A, LAMBDA))
@@ -129,7 +128,7 @@ class PathLimits(NamedTuple):
             slope = -(used[:, B] + used[:, V] / (2 * np.sqrt(b))) / used[:, A]
         return Extreme(bounds[k, row], slope, row)
 
-    def can_rest(self, sign: float = 1.0) -> NDArray[np.bool_]:
+    def can_rest(self, sign: float = 1.0) -> Flags:
         """Whether rows without lambda allow an a of some `sign`, or zero, at rest, shape (...,)."""
         least, most = find_range(sign * self.rows[..., A], self.rows[..., ONE])
         return np.asarray((np.maximum(least, 0.0) <= most) & (least < np.inf))
@@ -184,7 +183,7 @@ class BestInternalForce(NamedTuple):
     internal_force: Array  # (n,) [N]
     # (n, 2): limits, as indices into the set, that keep it from being larger, those of contacts
     # first
-    owners: NDArray[np.int64]
+    owners: Numbers
 
 
 class InternalForceLimits(NamedTuple):

@@ -12,9 +12,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from .dynamics import ONE, A, B, V
 from .path_limits import PathLimits, find_range
 
@@ -43,8 +42,8 @@ class SpeedProfile(NamedTuple):
     """Minimum-time profiles along paths, (..., N) intervals."""
 
     b: Array  # (..., N + 1) [m^2/s^2]: at the nodes
-    modes: NDArray[np.int64]  # (..., N): `SweepMode` of the intervals
-    blocked: NDArray[np.int64]  # (...,): an interval without a motion, or -1
+    modes: Numbers  # (..., N): `SweepMode` of the intervals
+    blocked: Numbers  # (...,): an interval without a motion, or -1
 
     def find_durations(self, steps: Array) -> Array:
         """Durations for intervals of lengths `steps`, (...,) [s]; infinite without a motion."""

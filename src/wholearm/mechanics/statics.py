@@ -24,9 +24,8 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Flags, Numbers, sort_unique
 from ..contacts.formation import Formation
 from .dynamics import find_freedoms, null_vector
 
@@ -207,13 +206,13 @@ class Statics:
         return find_freedoms(self.kinematics.P[0], self.scene.mass_diagonal, _TINY)
 
     @cached_property
-    def near(self) -> NDArray[np.bool_]:
+    def near(self) -> Flags:
         """Which limits of the formation are zero here, shape (n_limits,)."""
         limits = self.formation.evaluate_limits(self.z[None])[0]
         return np.asarray(np.abs(limits) < self.scene.touching)
 
     @cached_property
-    def opening(self) -> tuple[Array, NDArray[np.int64]]:
+    def opening(self) -> tuple[Array, Numbers]:
         """Slopes of the closed gaps, (k, 5), which can only open; which limits have kinks instead.
 
         So has a pointed fingertip at a vertex.
@@ -355,7 +354,7 @@ def list_sectors(rates: Array) -> list[Array]:
 
 
 @lru_cache(maxsize=16)
-def _choose(count: int, k: int) -> NDArray[np.int64]:
+def _choose(count: int, k: int) -> Numbers:
     """Every choice of k out of `count` rows, shape (m, k)."""
     return np.array(list(combinations(range(count), k)), dtype=np.int64).reshape(-1, k)
 

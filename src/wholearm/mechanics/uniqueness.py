@@ -20,9 +20,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..contacts.formation import Formation, Kinematics
 from . import UNIQUENESS
 
@@ -43,7 +42,7 @@ class Minors(NamedTuple):
 
     # (n,): 1 where friction makes no difference; forces are not unique at zero and below
     ratios: Array
-    choices: NDArray[np.int64]  # (n,): whose minor it is, among `modes`
+    choices: Numbers  # (n,): whose minor it is, among `modes`
     modes: list[tuple[str, ...]]  # choices of contacts: the mode of each, empty for those left out
     names: tuple[str, ...]  # of all contacts
 
@@ -86,7 +85,7 @@ def find_minors(
     return Minors(table.min(axis=1), table.argmin(axis=1), modes, formation.names)
 
 
-_Choices = tuple[tuple[tuple[str, ...], ...], NDArray[np.int64], NDArray[np.int64]]
+_Choices = tuple[tuple[tuple[str, ...], ...], Numbers, Numbers]
 
 
 @lru_cache(maxsize=64)

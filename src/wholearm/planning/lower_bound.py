@@ -16,9 +16,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..mechanics.dynamics import ONE, A, B, V, inverse
 from ..mechanics.limits import make_limits
@@ -49,9 +48,9 @@ class PathGrid(NamedTuple):
     """Angles of N + 1 nodes, and the segment that each of the N intervals belongs to."""
 
     angles: Array
-    owners: NDArray[np.int64]
+    owners: Numbers
 
-    def split(self, parts: NDArray[np.int64]) -> PathGrid:
+    def split(self, parts: Numbers) -> PathGrid:
         """Split every interval into a number of parts, shape (N,)."""
         owner = np.repeat(np.arange(len(parts)), parts)
         place = np.arange(len(owner)) - (np.cumsum(parts) - parts)[owner]
@@ -96,7 +95,7 @@ class PathTerms:
         counts = np.maximum(2, np.rint(np.diff(ends) / np.pi * intervals)).astype(np.int64)
         return PathGrid(ends, np.arange(len(counts))).split(counts)
 
-    def evaluate(self, angles: Array, owners: NDArray[np.int64]) -> PathLimits:
+    def evaluate(self, angles: Array, owners: Numbers) -> PathLimits:
         """Limits without lambda at angles (N, n), each row of them as part of a segment."""
         s, parts = self.place(angles), []
         owner, number, start, stop = np.array(self.pieces)[owners].T[..., None]
@@ -110,9 +109,7 @@ class PathTerms:
         return PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
 
 
-def find_limits(
-    curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
-) -> PathLimits:
+def find_limits(curve: Curve, epsilon: float, point: CurvePoint, segment: Numbers) -> PathLimits:
     """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
     forces = inverse(curve.formation, *point[:3], directions_of(curve, segment), point.kinematics)
     limits = make_limits(curve.formation, epsilon)

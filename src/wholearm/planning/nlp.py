@@ -21,13 +21,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, Expression
+from ..common.arrays import Array, Expression, Numbers
 from ..common.signals import beat, check
 from ..contacts.formation import Formation
 
-Indices = NDArray[np.int64]
+Indices = Numbers
 Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
 _K = TypeVar("_K")
 STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other

@@ -17,9 +17,8 @@ from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.errors import InputError, require_number
 from ..contacts.contact_limits import list_renamed
 from ..contacts.formation import Formation
@@ -539,9 +538,7 @@ def retime_within(
     return best, low
 
 
-def _follow(
-    curve: Curve, plan: Trajectory, rows: NDArray[np.int64]
-) -> tuple[Array, Array, Array, Array]:
+def _follow(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array, Array, Array]:
     """Places s, a, b and internal force of a plan's rows along a curve."""
     formation, metric = curve.formation, metric_weights(curve.formation.scene)
     z, grid = plan.z[rows], np.linspace(0.0, curve.length, 400)

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of
@@ -109,7 +108,7 @@ def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
 
 
 def _find_ambiguity(
-    curve: Curve, s: Array, at: CurvePoint, owners: NDArray[np.int64], least: float
+    curve: Curve, s: Array, at: CurvePoint, owners: Numbers, least: float
 ) -> tuple[str, float]:
     """Why contact forces along a curve are not unique (else empty), and up to where they are [m].
 

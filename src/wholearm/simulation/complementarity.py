@@ -27,9 +27,8 @@ from itertools import product, takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, Independent, find_root
+from ..common.arrays import Array, Flags, Independent, Numbers, find_root
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
@@ -63,7 +62,7 @@ class ContactProblem:
     b_n: Array  # (k,): normal rates without forces
     T: Array  # (s, n)
     b_t: Array  # (s,): sliding rates without forces
-    owner: NDArray[np.int64]  # (s,): the contact whose normal force bounds friction; -1 for a joint
+    owner: Numbers  # (s,): the contact whose normal force bounds friction; -1 for a joint
     mu: Array  # mu, bound (s,): abs(f) <= mu c_n + bound
     bound: Array
 
@@ -143,7 +142,7 @@ def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.
 @lru_cache(maxsize=256)
 def _combine(
     k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Flags]:
     """One choice of modes of k contacts and n coordinates, or all, with up to n conditions.
 
     Returns which way what may stick gives way, 0 where it does not, (m, s), and which forces are
@@ -253,7 +252,7 @@ def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
     return np.full(n, np.nan), np.inf
 
 
-def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
+def _choose(table: Array, rows: Numbers, pivots: Array) -> int:
     """Row of the lexicographically least ratio to its pivot; first, of what falls most."""
     sizes = np.abs(pivots)
     ratios = table[rows, 0] / sizes
@@ -362,7 +361,7 @@ class FreeRun(Run):
     resting: bool  # whether everything rests
     unique: bool  # whether the present modes were certainly the only solution
     residual: float  # largest residual of a contact problem so far
-    watched: NDArray[np.bool_]  # (N,): which pairs do not press
+    watched: Flags  # (N,): which pairs do not press
     level: Array  # (N,) [m]: gap at which a pair that touches closes
     before: StepEnd
     after: StepEnd
@@ -451,7 +450,7 @@ class FreeRun(Run):
             rows = system.evaluate(self.z, self.v, near).A / root
             self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
 
-    def _face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def _face(self, z: Array, v: Array) -> tuple[Array, Flags]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
         scales = self.system.scales
         gaps, ranges = self.system.look(z)

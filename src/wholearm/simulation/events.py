@@ -8,9 +8,8 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, Numbers, find_runs
 from ..common.document import Drawn
 from ..common.errors import SimulationError
 from ..problem.definition import Problem
@@ -134,7 +133,7 @@ class Simulation(Drawn):
     z_dot: Array
     z_ddot: Array
     tau: Array  # (n, 2) [N m]
-    phase: NDArray[np.int64]  # (n,): index of the phase, from 0
+    phase: Numbers  # (n,): index of the phase, from 0
     contacts: tuple[str, ...]  # every contact of the problem
     # c_n, c_t (n, m) [N]: naN where a contact is not in the formation, and at rest, where forces
     # are indeterminate
@@ -165,7 +164,7 @@ class Simulation(Drawn):
 
         SimulationError if there is no motion.
         """
-        chosen, problem = list[NDArray[np.int64]](), self.problem
+        chosen, problem = list[Numbers](), self.problem
         # Rows whose times increase in each phase, but for one repetition where forces step.
         for index in range(int(self.phase[-1]) + 1):
             rows = np.flatnonzero(self.phase == index)

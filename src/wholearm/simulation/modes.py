@@ -41,9 +41,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
 
-from ..common.arrays import Array, sort_unique
+from ..common.arrays import Array, Flags, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -222,7 +221,7 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     return Response(mode, signs, c, acceleration, rates, ratio)
 
 
-def find_fixed(mode: Mode, rows: ContactRows) -> NDArray[np.bool_]:
+def find_fixed(mode: Mode, rows: ContactRows) -> Flags:
     """Which contacts, then joints, a mode keeps fixed, (n_c + 2,)."""
     A, A_t, joints = rows.A, rows.A_t, np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)

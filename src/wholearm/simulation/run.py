@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..common.arrays import Array, find_root
+from ..common.arrays import Array, Flags, find_root
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
@@ -145,7 +145,7 @@ class Run(ABC):
         start, stop = self.breaks[self.piece : self.piece + 2]
         return (start + stop + x * (stop - start)) / 2
 
-    def find_torque_steps(self, torque: TorqueProfile) -> NDArray[np.bool_]:
+    def find_torque_steps(self, torque: TorqueProfile) -> Flags:
         """Whether torques step between successive pieces, shape (k - 1,)."""
         return np.asarray(np.abs(torque.jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
 

@@ -18,9 +18,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Flags
 from ..scene.model import Scene, cross_product
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ class Balance(NamedTuple):
     rates: Array
     # (n, n_c + 2): where contacts slide and joints turn against the sense that the motion's
     # friction assumes
-    against: NDArray[np.bool_]
+    against: Flags
     names: tuple[str, ...]  # of the contacts
 
     def find_worst(self) -> tuple[float, int, str]:

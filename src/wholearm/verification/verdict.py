@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Numbers
 from ..common.fields import POSITIVE, declare, key, read_keys
 from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.formation import Formation, Kinematics
@@ -145,7 +144,7 @@ def describe_thin_margins(
 
 
 def find_uniqueness_margin(
-    phase: Phase, motion: Trajectory | Simulation, rows: NDArray[np.int64]
+    phase: Phase, motion: Trajectory | Simulation, rows: Numbers
 ) -> UniquenessMargin | None:
     """The least uniqueness margin in a phase; None if nothing moved.
 
@@ -179,7 +178,7 @@ def find_wedged(
     problem: Problem,
     phase: Phase,
     motion: Trajectory | Simulation,
-    rows: NDArray[np.int64],
+    rows: Numbers,
     slow: float,
     start: float = -np.inf,
 ) -> float | None:

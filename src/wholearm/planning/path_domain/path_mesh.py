@@ -6,9 +6,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, sort_unique
+from ...common.arrays import Array, Numbers, sort_unique
 from ...geometry.curve import Curve
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
@@ -42,7 +41,7 @@ def make_grid(
     return lay_out(pairs, np.searchsorted(stops[:-1], pairs.mean(axis=1)), rests, held)
 
 
-def share_out(elements: int, weights: Array) -> NDArray[np.int64]:
+def share_out(elements: int, weights: Array) -> Numbers:
     """Share out elements by weights, at least one each."""
     # Halves go up whatever their last bit is.
     wanted = weights / weights.sum() * elements + 0.5 + 1e-6
@@ -142,7 +141,7 @@ def find_fastest(data: PhaseData) -> Fastest | None:
     return Fastest(nodes, b, every[apart])
 
 
-def _find_crossings(sides: PathLimits, places: Array, b: Array, active: NDArray[np.int64]) -> Array:
+def _find_crossings(sides: PathLimits, places: Array, b: Array, active: Numbers) -> Array:
     """Where from each place to the next the bounds of s'' by their active pairs of sides cross [m].
 
     A pair that bounds s'' at one place may not do so at the other; amid them if they do not cross.

@@ -20,9 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, jacobi_nodes
+from ...common.arrays import Array, Numbers, jacobi_nodes
 from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.trajectory import Samples
@@ -64,7 +63,7 @@ class Grid(NamedTuple):
     """Nodes on a curve."""
 
     s: Array  # (N + 1,) [m]: element by element, equal where two elements meet
-    segment: NDArray[np.int64]  # (N + 1,): of the curve, for each node's forces
+    segment: Numbers  # (N + 1,): of the curve, for each node's forces
     rests: tuple[bool, bool]  # whether the motion starts and ends at rest
     held: bool  # whether it does so without acceleration
     bends: Array  # (E,): c of the elements, zero but for the kind `INSIDE` of `held` motions
@@ -75,7 +74,7 @@ class Grid(NamedTuple):
         return np.diff(self.s)
 
     @property
-    def nonempty(self) -> NDArray[np.int64]:
+    def nonempty(self) -> Numbers:
         """The intervals inside elements."""
         k = np.arange(len(self.s) - 1)
         return k[k % NODES < DEGREE]
@@ -86,7 +85,7 @@ class Grid(NamedTuple):
         return self.s.reshape(-1, NODES)[:, [0, -1]]
 
     @property
-    def kinds(self) -> NDArray[np.int64]:
+    def kinds(self) -> Numbers:
         """Kind of each element, shape (E,)."""
         kinds = np.full(len(self.s) // NODES, INSIDE)
         ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
@@ -127,9 +126,7 @@ class Grid(NamedTuple):
         return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
 
 
-def lay_out(
-    edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool], held: bool = False
-) -> Grid:
+def lay_out(edges: Array, segment: Numbers, rests: tuple[bool, bool], held: bool = False) -> Grid:
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
     bends = np.zeros(len(edges))
     grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held, bends)
@@ -198,7 +195,7 @@ class Elements:
             self._b[:, 1:-1] *= 1 - c
             self._b[:, 2:] += 4 * c * a / (powers + 2)
 
-    def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
+    def find_y(self, k: Numbers, done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
         power, c = self._power[k // NODES], self.grid.bends[k // NODES]
         y, later = self._y[k], self._y[k + 1]
@@ -214,13 +211,13 @@ class Elements:
         here[at] = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
         return here
 
-    def find_ramps(self, k: NDArray[np.int64]) -> tuple[Any, Array, Array, Array]:
+    def find_ramps(self, k: Numbers) -> tuple[Any, Array, Array, Array]:
         """Which of the intervals k are next to rest, the power of y in s, y there and its rise."""
         rooted = np.flatnonzero(self._power[k // NODES] > 1)
         k = k[rooted]
         return rooted, self._power[k // NODES], self._y[k], self._y[k + 1] - self._y[k]
 
-    def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
+    def evaluate(self, k: Numbers, y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
         element = k // NODES
         motion = self._motion[element, -1].T
@@ -346,7 +343,7 @@ class PathMotion:
         """Names of the phase's contacts."""
         return self.curve.formation.names
 
-    def locate(self, t: Array) -> tuple[Array, NDArray[np.int64], Profile]:
+    def locate(self, t: Array) -> tuple[Array, Numbers, Profile]:
         """Arc length [m], segment and profile at times `t`, each of shape (n,)."""
         nonempty = self.grid.nonempty
         n = np.clip(np.searchsorted(self.times[nonempty], t, side="right") - 1, 0, None)

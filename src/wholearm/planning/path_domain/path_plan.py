@@ -36,9 +36,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, Expression
+from ...common.arrays import Array, Expression, Flags
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import LAMBDA, ONE, A, B, V, reduced_inertia
@@ -768,7 +767,7 @@ class PathNLP:
     g: Columns
 
     @cached_property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Flags:
         """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
         mask = np.ones((self.intervals + 1, self.node.count), dtype=bool)
         mask[[0, -1], self.node["b"]] = False

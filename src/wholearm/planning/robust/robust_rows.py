@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, Numbers
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve, CurvePoint, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
@@ -58,7 +58,7 @@ class RobustLimits(NamedTuple):
     radii: Array  # (p,)
     rows: Array  # (m, n_c + R): those of the force limits, h
     s: Array  # (n,) [m]: places of the signs, segment by segment
-    segment: NDArray[np.int64]  # (n,)
+    segment: Numbers  # (n,)
     signs: NDArray[np.int8]  # (n, m, COPIES, p)
 
     def find_variations(
@@ -80,7 +80,7 @@ class RobustLimits(NamedTuple):
                 variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
         return np.asarray(variations * self.radii[:, None])
 
-    def pick_signs(self, s: Array, segment: NDArray[np.int64]) -> NDArray[np.int8]:
+    def pick_signs(self, s: Array, segment: Numbers) -> NDArray[np.int8]:
         """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
         rows = np.zeros(len(s), dtype=np.int64)
         for number in set(segment.tolist()):

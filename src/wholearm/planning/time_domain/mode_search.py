@@ -12,9 +12,8 @@ from operator import ne
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, find_runs
+from ...common.arrays import Array, Flags, find_runs
 from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
@@ -437,9 +436,7 @@ def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) 
     return runs
 
 
-def _find_runs(
-    flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array
-) -> list[ModeRun]:
+def _find_runs(flags: Flags, stage: Stage, scheme: Scheme, signs: Array) -> list[ModeRun]:
     """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
     longest, breaks = [], stage.guess.breaks
     for row, column in enumerate(flags.T):

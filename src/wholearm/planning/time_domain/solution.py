@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array, find_minima
+from ...common.arrays import Array, Numbers, find_minima
 from ...common.errors import Parameter, SolverError
 from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
@@ -459,7 +459,7 @@ class TimeIterate:
         return gains
 
     @cached_property
-    def halvings(self) -> list[NDArray[np.int64]]:
+    def halvings(self) -> list[Numbers]:
         """How often to halve each interval of each stage.
 
         Gains do not count with a given number of intervals.
@@ -473,7 +473,7 @@ class TimeIterate:
         if self.refined >= SETTINGS.refinements or intervals >= most:
             return none
         on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-        nlp, prices, times = solution.nlp, list[Array](), list[NDArray[np.int64]]()
+        nlp, prices, times = solution.nlp, list[Array](), list[Numbers]()
         for rows, miss, motion in zip(nlp.rows_of, self.misses, self.motions, strict=True):
             # Relative cost of raising limits by their misses, by multipliers.
             price = np.zeros_like(miss.held)
@@ -708,7 +708,7 @@ def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
     return np.asarray(np.where(allowed, value, 0.0).min(axis=1, initial=0.0))
 
 
-def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:
+def spread_halvings(shares: Sequence[Array], most: float) -> list[Numbers]:
     """How often to halve intervals, (K,) each, the largest first, until errors sum up to `most`.
 
     Gains of better torques decrease with the square of the length.

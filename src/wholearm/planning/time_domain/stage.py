@@ -13,9 +13,8 @@ from operator import is_not, mul
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, jacobi_nodes
+from ...common.arrays import Array, Numbers, jacobi_nodes
 from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
@@ -224,7 +223,7 @@ class LimitMisses(NamedTuple):
         triples = zip(self, misses, factors, strict=True)
         return LimitMisses(*(amounts + factor * more for amounts, more, factor in triples))
 
-    def halve(self, times: NDArray[np.int64]) -> LimitMisses:
+    def halve(self, times: Numbers) -> LimitMisses:
         """On intervals halved so many times, (K,); zero on those that are."""
         tables = (np.where(times[:, None] > 0, 0.0, amounts) for amounts in self)
         return LimitMisses(*(np.repeat(table, 2**times, axis=0) for table in tables))
@@ -360,7 +359,7 @@ def with_controls(part: StagePoints, count: int) -> StagePoints:
 
 
 def bisect_intervals(
-    stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
+    stages: Sequence[Stage], scheme: Scheme, times: Sequence[Numbers]
 ) -> list[Stage]:
     """Stages with intervals halved so many times, each of shape (K,)."""
     halved = list[Stage]()

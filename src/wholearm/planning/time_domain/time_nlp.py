@@ -29,9 +29,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from ...common.arrays import Array, Expression
+from ...common.arrays import Array, Expression, Flags
 from ...common.errors import Parameter
 from ...contacts.contact_limits import build_limits, list_renamed
 from ...contacts.elemental import Contact, build_features
@@ -587,7 +586,7 @@ def hold_ends(
             rows.add_entries(bound, layouts[0].tau[0, 0, joint], 1 / limit)
 
 
-def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
+def find_relieved(stage: Stage, limits: LimitSet) -> Flags:
     """Sides without effect in each interval, as forces vanish or set in or slip, (K, n_sides)."""
     relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
     if stage.formation.scene.has_slow_motors:
@@ -599,7 +598,7 @@ def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
     return relieved
 
 
-def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> NDArray[np.bool_]:
+def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> Flags:
     """Whether sides, (n_sides,), are of limits of some kinds of a contact."""
     name, owners = stage.formation.names[contact], limits.owners[limits.sides[0]]
     flags = [limit.kind in kinds and limit.part == name for limit in limits.limits]
