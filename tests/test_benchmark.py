@@ -21,18 +21,9 @@ from rows import each
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved, text_of
 from tiny_study import allow, measure, misbehave
 from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
-from wholearm.benchmark import STUDIES, precision
-from wholearm.benchmark.corpus import (
-    BANDS,
-    FAMILIES,
-    LARGEST,
-    answer,
-    compare,
-    count,
-    list_cases,
-    perturb_scenes,
-)
+from wholearm.benchmark import STUDIES, corpus, precision
 from wholearm.benchmark.corpus import STUDY as CORPUS
+from wholearm.benchmark.corpus import answer, compare, count, list_cases
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.growth import WORK, run_work
 from wholearm.benchmark.skip import STUDY as SKIP
@@ -304,7 +295,7 @@ def test_counts_of_one_phase_are_those_of_theory() -> None:
     assert found["phase 1 of 1: unknowns"] == 3 * nodes - 2
     # How the speed goes on, and the forces and torques at each node.
     assert found["phase 1 of 1: rows"] == nodes - 1 + (contacts + 2) * nodes
-    assert found["panels of curves"] >= 1 and set(BANDS) < set(found)
+    assert found["panels of curves"] >= 1 and set(corpus.BANDS) < set(found)
     assert found["iterations"] > 1 and found["evaluations of the replay"] > 12
 
 
@@ -374,7 +365,7 @@ def test_bad_input_is_refused_as_ever() -> None:
 def test_every_case_has_a_stored_answer() -> None:
     cases = list(list_cases())
     assert {name(case) for case in cases} == set(STORED)
-    assert {case[0] for case in cases} == set(FAMILIES)
+    assert {case[0] for case in cases} == set(corpus.FAMILIES)
 
 
 PLANNED: dict[str, Any] = {
@@ -462,7 +453,7 @@ def test_the_command_fails_where_answers_differ(
 @pytest.mark.usefixtures("exact")
 def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
     exact = problem_of(SQUARE)
-    perturb_scenes(2**20)
+    corpus.perturb_scenes(2**20)
     once = read_problem(str(SQUARE))
     again = once.with_(name="again")
     pairs = [
@@ -471,7 +462,7 @@ def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
     ]
     for one, other, third in zip(*pairs, strict=True):
         change = np.abs(np.subtract(other, one))
-        assert (change <= (2 * LARGEST + 1) * 2.0**-52 * np.abs(one)).all()
+        assert (change <= (2 * corpus.LARGEST + 1) * 2.0**-52 * np.abs(one)).all()
         np.testing.assert_array_equal(other, third)
     assert (pairs[0][0] != pairs[1][0]).any()
     with pytest.raises(InputError, match=r"object\.mass"):

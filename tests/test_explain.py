@@ -25,15 +25,9 @@ from wholearm.benchmark.refusals import judge
 from wholearm.common import errors
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.limits import EPSILON
+from wholearm.planning import explain
 from wholearm.planning import explain as explanation
-from wholearm.planning.explain import (
-    change_limit,
-    explain_stages,
-    find_changes,
-    list_beyond,
-    refuse,
-    require_hold_at_ends,
-)
+from wholearm.planning.explain import change_limit, explain_stages, find_changes, list_beyond
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import Guesses
@@ -80,10 +74,10 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
     last = problem.phases[-1:]
     alone = replace(search(problem), phases=last)
     stages = Guesses(alone, TURNED).nearest.stages
-    refuse(alone, stages, None)
+    explain.refuse(alone, stages, None)
     slow = problem.with_(torque_rate_limit=rate)
     message = why_not(
-        lambda: require_hold_at_ends(replace(search(slow), phases=slow.phases[-1:]), stages)
+        lambda: explain.require_hold_at_ends(replace(search(slow), phases=slow.phases[-1:]), stages)
     )
     # With the contact that is gained there the object can be held, but not while it slows down.
     assert "none that bring it to rest at its end, x = 88.04 mm" in message

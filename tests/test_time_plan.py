@@ -17,23 +17,13 @@ from scipy.optimize import minimize
 
 import scenes
 import shipped
+import wholearm
 import wholearm.planning.time_domain.guesses as guesses
 from once import once
 from plane import finger_gap, make_formation, measure_gaps, measure_slip, unbalance
 from planned import plan_landing as known_landing
 from timed import fastest_landing, instants, integrate, landing, plan_landing, stages_of, total
-from wholearm import (
-    End,
-    Formation,
-    InfeasibleError,
-    InputError,
-    PlanOptions,
-    Problem,
-    Trajectory,
-    Until,
-    simulate,
-    verify,
-)
+from wholearm import End, PlanOptions, Problem, Trajectory, verify
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
@@ -450,7 +440,7 @@ def plan_again() -> float:
 def test_an_impact_is_passed_where_no_motion_comes_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(part: PlanPart, bounds: list[int], *others: Any) -> Any:
         if len(bounds) > 2:
-            raise InfeasibleError("no motion comes to rest")
+            raise wholearm.InfeasibleError("no motion comes to rest")
         return plan_stops(part, bounds, *others)
 
     monkeypatch.setattr(time_plan, "plan_stops", stop)
@@ -513,7 +503,7 @@ def test_a_part_of_a_block_starts_at_rest() -> None:
     assert np.abs(part.motion.evaluate(np.zeros(1)).z_dot).max() < 1e-9
 
 
-def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Array:
+def find_impulses(formation: wholearm.Formation, z: Array, v: Array, v_next: Array) -> Array:
     """Impulses on sliding contacts that explain a jump of z', by least squares: M5 dv = G^T p."""
     kinematics = formation.evaluate(z[None], v_next[None])
     slip = kinematics.A_t[0] @ v_next
@@ -720,7 +710,7 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     sliding = scenes.tilting()
     (phase,) = sliding.phases
     rolling = scenes.roll(phase.formation, "v1-palm")
-    first = replace(phase, until=Until(), end=End.SMOOTH)
+    first = replace(phase, until=wholearm.Until(), end=End.SMOOTH)
     last = replace(phase, index=1, formation=rolling)
     problem = replace(sliding, phases=(first, last))
     plan = solve(problem, time_intervals=5, replay=False).trajectory
@@ -779,7 +769,9 @@ def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:
     x, phi = trace_phases(problem)[0].end[[0, 2]].tolist()
     same = pin(problem, 0, ("x", x), ("phi", phi))
     assert trace_phases(same)[0].end.tolist() == trace_phases(problem)[0].end.tolist()
-    with pytest.raises(InputError, match=r"v3-finger1 at x = .* is never reached") as caught:
+    with pytest.raises(
+        wholearm.InputError, match=r"v3-finger1 at x = .* is never reached"
+    ) as caught:
         trace_phases(pin(problem, 0, ("x", x + 1e-3)))
     assert caught.value.key == "phases[1].until"
     assert caught.value.problem.endswith("; one freedom leaves no choice")
@@ -787,7 +779,7 @@ def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:
 
 def test_another_place_than_the_one_pinned_fails() -> None:
     problem, trajectory = known_landing()
-    simulation = simulate(problem, trajectory.torque)
+    simulation = wholearm.simulate(problem, trajectory.torque)
     allowance, length = Allowance(), problem.scene.scales.length
     for off, missed in ((0.0, False), (0.9, False), (1.1, True)):
         # The motion ends at 16 mm.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from operator import ne
+from operator import itemgetter, ne
 from typing import NamedTuple
 
 import numpy as np
@@ -148,20 +148,46 @@ def _find_nearest(stage: Stage, search: TimeSearch, node: int) -> Mode | None:
 
     None if it may keep that, with one degree of freedom, or without a mode that is possible.
     """
+    mode = mode_of(stage)
+    possible = _list_possible(stage, search, node)
+    differing = [(sum(map(ne, signs, mode)), -margin, signs) for margin, signs in possible]
+    count, _, nearest = min(differing, default=(0, 0.0, mode))
+    return nearest if count else None
+
+
+def _list_possible(stage: Stage, search: TimeSearch, node: int) -> list[tuple[float, Mode]]:
+    """Modes that continuous torques allow at the start (`node` 0) or end (-1), with margins."""
     own, epsilon = search.problem.phases[stage.phase].formation, search.problem.epsilon
-    z, held, mode = stage.guess.nodes[node, 0], None, mode_of(stage)
+    z, held = stage.guess.nodes[node, 0], None
     if own.n_constraints >= 4:
-        return None
+        return []
     if node:
         touching = make_formation(own.scene, stage.ending.contacts)
         held = Statics(touching, z).torque_polygon(epsilon)
+    listed = Statics(own, z).list_continuous(epsilon, held) or ()
     # A joint that rests is no mode of a stage.
-    listed = [
-        pair for pair in Statics(own, z).list_continuous(epsilon, held) or () if all(pair[1][-2:])
-    ]
-    differing = [(sum(map(ne, signs, mode)), -margin, signs) for margin, signs in listed]
-    count, _, nearest = min(differing, default=(0, 0.0, mode))
-    return nearest if count else None
+    return [pair for pair in listed if all(pair[1][-2:])]
+
+
+def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> list[list[Stage]]:
+    """Stages with a contact that rolls in the first or last interval of a motion from rest to rest.
+
+    Those first in which it slides most slowly: with continuous torques it may not slide at all.
+    """
+    begins, rolling = True, list[tuple[float, list[Stage]]]()
+    for k, stage in enumerate(stages):
+        last, mode = stage.intervals - 1, mode_of(stage)
+        for node, first in [(0, 0)] * begins + [(-1, last)] * stage.rests:
+            part = stage.guess
+            rates = np.abs(stage.measure_senses(part.z[first], part.v[first])).max(axis=0)
+            for _, signs in _list_possible(stage, search, node):
+                rows = [row for row, pair in enumerate(zip(signs, mode, strict=True)) if ne(*pair)]
+                if rows and not any(signs[row] for row in rows):
+                    pieces = split(stage, search.scheme, first, first + 1, signs)
+                    changed = link(merge([*stages[:k], *pieces, *stages[k + 1 :]]))
+                    rolling.append((float(rates[rows].max() / rates.max()), changed))
+        begins = stage.rests
+    return [changed for _, changed in sorted(rolling, key=itemgetter(0))]
 
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:

@@ -48,6 +48,7 @@ from .mode_search import (
     improve,
     link,
     list_neighbours,
+    roll_at_ends,
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
 # a pentagon, 0.369 s from the modes of a plan of 0.094 s (the test of given modes)
 SLOWER = 1.2
+ROLLING = 2  # most ends at which a contact rolls that are tried
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 
 
@@ -196,33 +198,43 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
 
     require_hold_at_ends(search, free)
     plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
-    stages = [stage.stretch(1.3) for stage in adapt_ends(free, search)]
+    own = adapt_ends(free, search)
+    stages = own
 
-    def reaches(factor: float) -> bool:
+    def reaches(factor: float, most: int = 80) -> bool:
         """Whether there is a solution with motors so many times as quick, from the last one."""
         nonlocal stages
         tried.append(factor)
         scene = search.problem.scene.quicken(factor)
         quick = replace(search, problem=replace(search.problem, scene=scene))
-        solution = quick.solve(link([stage.move_to(scene) for stage in stages]), most=80)
+        solution = quick.solve(link([stage.move_to(scene) for stage in stages]), most=most)
         if solution.success:
             plans.append((factor, quick, solution))
             stages = solution.stages
         return solution.success
 
-    step = 4.0
-    if not reaches(1.0) and (reaches(step) or reaches(step**2)):
+    def refine_last() -> TimeSolution:
+        return plans[-1][2] if search.only_begins else refine_stages(search, plans[-1][2])
+
+    # Case of contacts that roll at an end: phase 8 of query 24, in whose plan with free torques one
+    # hardly slides.
+    for candidate in chain([own], islice(roll_at_ends(own, search), ROLLING)):
+        stages = [stage.stretch(1.3) for stage in candidate]
+        most = 80 if candidate is own else ITERATIONS
+        if reaches(1.0, most) and (solution := refine_last()).success:
+            return solution
+    stages, step = [stage.stretch(1.3) for stage in own], 4.0
+    if plans:
+        reaches(step)
+        # Case: the pentagon (0, 0), (90, 0), (100, 50), (60, 90), (0, 70) mm, 0.28 kg, of
+        # `wholearm new` with 900 N m/s, phase 6 to edge 1.
+        reaches(step**2)
+    elif reaches(step) or reaches(step**2):
         while step > 1.1 and plans[-1][0] > 1:
             if not reaches(max(1.0, plans[-1][0] / step)):
                 step = math.sqrt(step)
-    if plans and plans[-1][0] == 1:
-        solution = plans[-1][2] if search.only_begins else refine_stages(search, plans[-1][2])
-        if solution.success:
+        if plans[-1][0] == 1 and (solution := refine_last()).success:
             return solution
-        reaches(4.0)
-        # Case: the pentagon (0, 0), (90, 0), (100, 50), (60, 90), (0, 70) mm, 0.28 kg, of
-        # `wholearm new` with 900 N m/s, phase 6 to edge 1.
-        reaches(16.0)
     for factor, quick, solution in sorted(plans, key=lambda plan: plan[0]):
         rough = replace(quick, options=quick.options.roughen())
         if factor > 1 and refine_stages(rough, solution).success:
