@@ -220,8 +220,10 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     # hardly slides.
     for candidate in chain([own], islice(roll_at_ends(own, search), ROLLING)):
         stages = [stage.stretch(1.3) for stage in candidate]
-        most = 80 if candidate is own else ITERATIONS
-        if reaches(1.0, most) and (solution := refine_last()).success:
+        if (
+            reaches(1.0, 80 if candidate is own else ITERATIONS)
+            and (solution := refine_last()).success
+        ):
             return solution
     stages, step = [stage.stretch(1.3) for stage in own], 4.0
     if plans:
