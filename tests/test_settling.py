@@ -343,6 +343,9 @@ def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
     slow = heptagon.with_(torque_rate_limit1=4.0, torque_rate_limit2=60.0)
     (t, text), *others = describe_motors(slow, torque)
     assert not others and t < 0.02 and "tau_1 changes at 5 N m/s" in text
+    # Within a microsecond the same rate gains next to nothing on its limit.
+    brief = TorqueProfile.join_rows(np.array([[0.0, 0.0, 0.0], [1e-6, 5e-6, 0.0], [1.0, 0.0, 0.0]]))
+    assert describe_motors(slow, brief) == []
     lagging = heptagon.with_(actuator_lag2=0.04)
     assert "takes a command of 2.5 N m" in describe_motors(lagging, torque)[0][1]
     steps = np.column_stack([[0.0, 0.02, 0.02, 0.05], rows * [[1], [1], [5], [5]]])
