@@ -169,7 +169,7 @@ def _list_possible(stage: Stage, search: TimeSearch, node: int) -> list[tuple[fl
     return [pair for pair in listed if all(pair[1][-2:])]
 
 
-def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> list[list[Stage]]:
+def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[Stage]]:
     """Stages with a contact that rolls in the first or last interval of a motion from rest to rest.
 
     Those first in which it slides most slowly: with continuous torques it may not slide at all.
@@ -187,7 +187,7 @@ def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> list[list[Stage
                     changed = link(merge([*stages[:k], *pieces, *stages[k + 1 :]]))
                     rolling.append((float(rates[rows].max() / rates.max()), changed))
         begins = stage.rests
-    return [changed for _, changed in sorted(rolling, key=itemgetter(0))]
+    yield from (changed for _, changed in sorted(rolling, key=itemgetter(0)))
 
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:
