@@ -198,8 +198,7 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
 
     require_hold_at_ends(search, free)
     plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
-    own = adapt_ends(free, search)
-    stages = own
+    stages = own = adapt_ends(free, search)
 
     def reaches(factor: float, most: int = 80) -> bool:
         """Whether there is a solution with motors so many times as quick, from the last one."""
