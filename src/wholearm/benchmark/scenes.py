@@ -11,7 +11,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -21,7 +21,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, find_touching
-from ..mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
+from ..mapping.borders import NOWHERE, Piece, Window, cut, label_cells, list_tracks
 from ..mapping.formation_list import Stretch, format_route, list_formations, tolerance
 from ..problem.definition import Problem
 from ..problem.read import build_problem
@@ -143,15 +143,8 @@ def _find_pieces(problem: Problem) -> list[Piece]:
     low = max(phi for phi in angles if phi < here[1] - 1e-6)
     high = min(phi for phi in angles if phi > here[1] + 1e-6)
     window = Window((here[0] - reach, here[0] + reach), (low - 0.05, high + 0.05))
-    tracks = [
-        palm_track(scene, edge, phi, np.linspace(*window.x, PLACES))
-        for phi, edge in window.flush_angles(scene)
-    ]
-    for first, last, vertex in window.bands(scene):
-        for finger in (0, 1):
-            for edge in range(scene.polygon.n_vertices):
-                places = np.linspace(first, last, PLACES)
-                tracks.append(flush_track(scene, finger, edge, vertex, places))
+    flush = (track for track in list_tracks(scene, window, PLACES) if track.flush is not None)
+    tracks = [replace(t, places=np.linspace(t.places[0], t.places[-1], PLACES)) for t in flush]
     return cut(scene, tracks, window)
 
 
