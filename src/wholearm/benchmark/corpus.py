@@ -37,8 +37,9 @@ from wholearm import Plan, Problem
 
 from ..common.document import Table, plain
 from ..common.files import read_json, write_text
-from ..geometry.tracing import trace_phases
+from ..geometry.tracing import check_phases, trace_phases
 from ..planning.nlp import record_runs
+from ..problem.read import build_problem
 from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
@@ -227,18 +228,9 @@ def _reach(folder: Path, number: int) -> Row:
 
 
 def _scene(folder: Path, number: int, objective: str) -> Row:
-    return _solve(_read_table(draw_case(SEED, number).table), objective=objective)
-
-
-def _read_table(table: Any) -> Problem:
-    """A problem by way of its file, whose messages do not name the folder."""
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, "problem.toml")
-        path.write_text(write_toml(table), encoding="utf-8")
-        try:
-            return wholearm.load(str(path))
-        except wholearm.InputError as error:
-            raise wholearm.InputError("F", error.key, error.problem) from None
+    problem = build_problem(draw_case(SEED, number).table, "F")
+    check_phases(problem)
+    return _solve(problem, objective=objective)
 
 
 def _leg(folder: Path, number: int, objective: str) -> Row:
@@ -469,25 +461,32 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def _read(folder: Path, number: int) -> Row:
-    """A problem file with another entry; the message does not name the folder."""
+    """A problem file with another entry."""
     table = copy.deepcopy(BASE)
     change = change_tree(np.random.default_rng([SEED, number]), table, STRANGE)
-    return {"change": change} | _try(folder, lambda: _read_table(table))
+    return {"change": change} | _try_file("problem.toml", write_toml(table).encode(), wholearm.load)
 
 
-def _try(place: Path, work: Callable[[], object]) -> Row:
-    """Whether something is refused, by a message that does not name the place."""
+def _try(work: Callable[[], object]) -> Row:
+    """Whether something is refused, by which message."""
     try:
         work()
     except (wholearm.WholearmError, TypeError) as error:
-        message = str(error).replace(str(place), "F")
-        return {"refused": type(error).__name__, "message": message}
+        return {"refused": type(error).__name__, "message": str(error)}
     return {"refused": ""}
 
 
+def _try_file(name: str, content: bytes, work: Callable[[str], object]) -> Row:
+    """Whether a file is refused, by a message that does not name the folder."""
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, name)
+        path.write_bytes(content)
+        row = _try(partial(work, str(path)))
+    return {key: text.replace(str(path), "F") for key, text in row.items()}
+
+
 def _ask(folder: Path, name: str) -> Row:
-    problem = _load(folder, FOUR)
-    row = _try(folder, lambda: wholearm.solve(problem, **OPTIONS[name]))
+    row = _try(partial(wholearm.solve, _load(folder, FOUR), **OPTIONS[name]))
     return {key: mask(text) for key, text in row.items()}
 
 
@@ -495,15 +494,11 @@ def _read_torques(folder: Path, number: int) -> Row:
     """A table of torques with another entry."""
     rng = np.random.default_rng([SEED, number])
     change, content = damage_torques(rng, b"t,tau1,tau2\n0,0,0\n0.5,1,0\n1,0,0\n")
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, "bad.csv")
-        path.write_bytes(content)
 
-        def verify() -> None:
-            torque = wholearm.read_torque_csv(str(path))
-            wholearm.verify(_load(folder, "square"), torque)
+    def verify(path: str) -> None:
+        wholearm.verify(_load(folder, "square"), wholearm.read_torque_csv(path))
 
-        return {"change": change} | _try(path, verify)
+    return {"change": change} | _try_file("bad.csv", content, verify)
 
 
 FAMILIES: dict[str, tuple[Callable[..., Row], list[Case]]] = {
