@@ -48,13 +48,26 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
 
     An existing file is replaced, and what is not a file (a device, a pipe) is written to.
     """
-    target = os.fspath(path)
+    target, staged = os.fspath(path), _staged.get()
+    if staged is None:
+        # A single file is a group of one.
+        with together():
+            return write_whole(path, write)
     with name_file(target, failure="cannot be written"):
         if _is_special(target):
             with open(target, "wb") as stream:
                 write(stream)
-        else:
-            _replace(os.path.realpath(target), write)
+            return
+        folder, name = os.path.split(os.path.realpath(target))
+        part = os.path.join(folder, f".{name}.{os.getpid()}.{threading.get_ident()}.part")
+        _parts.add(part)
+        try:
+            with open(part, "xb") as stream:
+                write(stream)
+        except BaseException:
+            _remove(part)
+            raise
+        staged.append((part, target))
 
 
 @contextmanager
@@ -67,7 +80,7 @@ def together() -> Iterator[None]:
         with held():
             for part, target in staged:
                 with name_file(target, failure="cannot be written"):
-                    os.replace(part, target)
+                    os.replace(part, os.path.realpath(target))
     finally:
         _staged.reset(token)
         for part, _ in staged:
@@ -97,27 +110,6 @@ def make_folder(path: str, key: str = "") -> None:
 
 def _is_special(target: str) -> bool:
     return os.path.exists(target) and not os.path.isfile(target) and not os.path.isdir(target)
-
-
-def _replace(target: str, write: Callable[[BinaryIO], object]) -> None:
-    folder, name = os.path.split(target)
-    part = os.path.join(folder, f".{name}.{os.getpid()}.{threading.get_ident()}.part")
-    staged = _staged.get()
-    try:
-        _parts.add(part)
-        with open(part, "xb") as stream:
-            write(stream)
-        if staged is None:
-            with held():
-                os.replace(part, target)
-        else:
-            staged.append((part, target))
-    except BaseException:
-        _remove(part)
-        raise
-    finally:
-        if staged is None:
-            _parts.discard(part)
 
 
 def _remove(part: str) -> None:
