@@ -209,11 +209,8 @@ def assemble(
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, start = [], [], 0.0
     for motion in motions:
-        if isinstance(motion, HeldMotion):
-            local, row = motion.sample(samples)
-        else:
-            local = np.linspace(0.0, motion.duration, samples)
-            row = motion.evaluate(local)
+        whole = motion if isinstance(motion, HeldMotion) else HeldMotion(motion)
+        local, row = whole.sample(samples)
         rows.append(row.spread(motion.contacts, contacts))
         times.append(start + local)
         start += motion.duration
