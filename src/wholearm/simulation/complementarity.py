@@ -704,14 +704,13 @@ class FreeRun(Run):
         it is `decided` that everything rests at present, accelerations and breaches are rounding.
         """
         self.load(self.modes)
-        s, at, to = self.s, self.s.inputs, self.s.to
-        seen = []
+        s, torque, seen = self.s, self.s.inputs.torque, []
         for tau in np.vstack([np.zeros(2), self.system.scales.torque * np.eye(2)]):
-            at[s.at.torque] = 0.0
-            at[s.at.torque.start : s.at.torque.stop : self.torque.coefficients.shape[2]] = tau
+            torque[:] = 0.0
+            torque[:: self.torque.coefficients.shape[2]] = tau
             s.look()
-            rates = s.outputs[to.acceleration] * self.system.scales.time
-            margins = s.outputs[to.values][: s.rows.cone.stop]
+            rates = s.outputs.acceleration * self.system.scales.time
+            margins = s.outputs.values[: s.rows.cone.stop]
             seen.append(np.concatenate([margins, rates / self.system.units[self.system.n :]]))
         slopes = np.array([part - seen[0] for part in seen[1:]]).T / self.system.scales.torque
         values = slopes @ self.torque.coefficients[self.piece]
@@ -760,11 +759,11 @@ class FreeRun(Run):
 
     def measure(self) -> Array:
         """Event values of the steps, then ranges of kept pairs."""
-        out, to = self.s.outputs, self.s.to
-        motion = np.concatenate([out[: 2 * self.system.n], out[to.acceleration]])
+        out = self.s.outputs
+        motion = np.concatenate([out.y[: 2 * self.system.n], out.acceleration])
         motion = motion.reshape(3, self.system.n)
         self.after = StepEnd(motion, *self.system.look(motion[0]))
-        return np.concatenate([out[to.values], self.after.ranges[self.kept] / self.unit])
+        return np.concatenate([out.values, self.after.ranges[self.kept] / self.unit])
 
     @property
     def shift(self) -> Array:
@@ -835,8 +834,8 @@ class FreeRun(Run):
         # Some ten roundings of the gap count as closed.
         root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
         self.step_to(root)
-        out = self.s.outputs
-        return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
+        y = self.s.outputs.y
+        return root if self._face(y[:n], y[n : 2 * n])[1][pair] else None
 
     def _find_bracket(
         self, h: float, passed: Sequence[int]
@@ -896,7 +895,7 @@ class FreeRun(Run):
             return math.inf
         rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
         rate = rows.A @ self.v
-        bend = rows.A @ self.s.outputs[self.s.to.acceleration] + rows.bend
+        bend = rows.A @ self.s.outputs.acceleration + rows.bend
         # What parts more slowly was closed when the modes were chosen.
         back = (rate >= self.chatter) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))

@@ -244,12 +244,12 @@ class Record(NamedTuple):
     t: float
     phase: int
     kept: tuple[int, ...]  # pairs that press
+    impact: float  # [J]: energy lost to impacts so far
     y: Array  # z, z' and integrals
     acceleration: Array
     tau: Array
     c_n: Array  # c_n, c_t: of the kept pairs
     c_t: Array
-    impact: float  # [J]: energy lost to impacts so far
 
 
 def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:

@@ -171,13 +171,11 @@ class Replay(Run):
     @property
     def signs(self) -> Array:
         """Directions of contacts, then of joints, (n_c + 2,), zero for what is held or rolls."""
-        inputs, at = self.s.inputs, self.s.at
-        return np.concatenate([inputs[at.Xi], inputs[at.sigma][3:]])
+        return np.concatenate([self.s.inputs.Xi, self.s.inputs.sigma[3:]])
 
     @signs.setter
     def signs(self, signs: Array) -> None:
-        inputs, at = self.s.inputs, self.s.at
-        inputs[at.Xi], inputs[at.sigma][3:] = signs[:-2], signs[-2:]
+        self.s.inputs.Xi[:], self.s.inputs.sigma[3:] = signs[:-2], signs[-2:]
 
     def take(self, mode: modes.Mode) -> None:
         """Go on with the steps of a mode of the phase's formation."""
@@ -200,12 +198,12 @@ class Replay(Run):
         freedom, where contacts and joints come to rest one by one.
         """
         out, ends, scales = self.s.outputs, self.ends, self.system.scales
-        ends.state[:] = out[:10]
+        ends.state[:] = out.y[:10]
         ends.evaluate()
         self.distance, self.rate = ends.values[-2:].tolist()
-        values, speed = out[self.s.to.values], 1.0
+        values, speed = out.values, 1.0
         if self.mode.n_constraints >= 4:
-            size = float(self.heading @ (self.system.mass * out[5:10]))
+            size = float(self.heading @ (self.system.mass * out.y[5:10]))
             speed = size / (scales.speed * scales.mass**0.5)
         moving = values[: self.s.rows.slide.stop], values[-2:]
         last = self.distance / ends.unit, speed
@@ -230,7 +228,7 @@ class Replay(Run):
 
     def require_inertia(self) -> None:
         """Raise a `JammingError` where friction leaves no reduced inertia."""
-        ratio = float(self.s.outputs[self.s.to.ratio])
+        ratio = float(self.s.outputs.ratio[0])
         if not ratio > 0:
             self.fail_to_step(ratio)
 
@@ -402,7 +400,7 @@ class Replay(Run):
         try:
             return cast(Ending, super().move())
         except StuckError:
-            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
+            self.fail_to_step(float(self.s.outputs.ratio[0]))
 
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
@@ -410,11 +408,11 @@ class Replay(Run):
         if (self.values < -self.slack).any() and not self._is_at_end(t):
             rows = self.find_first(h)
         if self.minima:
-            records, least = self._look_inside(float(self.s.inputs[self.s.at.h]))
+            records, least = self._look_inside(float(self.s.inputs.h[0]))
         if least < math.inf:
             self.step_to(least)
             rows = self.find_first(least)
-        end = self.t + float(self.s.inputs[self.s.at.h])
+        end = self.t + float(self.s.inputs.h[0])
         self.records += [record for record in records if record.t < end]
         return rows
 
@@ -425,8 +423,8 @@ class Replay(Run):
         the step, infinity if there is none.
         """
         s, rows = self.s, self.s.rows
-        margins = s.outputs[s.to.values][: rows.cone.stop]
-        stage_margins = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
+        margins = s.outputs.values[: rows.cone.stop]
+        stage_margins = np.vstack([s.outputs.stages.reshape(-1, len(margins)), margins])
         inside = _INSIDE @ stage_margins
         # Of a normal force, what is less than any of the phase before counts.
         least, force = np.minimum(stage_margins[0], stage_margins[-1]), rows.force
@@ -470,7 +468,7 @@ class Replay(Run):
             coming = self.piece + 1
             speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
         elif self.phase.end is not End.SMOOTH:
-            speed = float(np.abs(self.s.outputs[5:10] / self.system.units[5:]).max())
+            speed = float(np.abs(self.s.outputs.y[5:10] / self.system.units[5:]).max())
         return speed < SLOW
 
     def _comes_later(self) -> bool:
@@ -534,7 +532,7 @@ class Replay(Run):
         sqrt(6 d / a) for the distance d; one that fades later is that of the next phase. Cases:
         phase 8 of query 79 and phase 14 of query 5 with limited rates.
         """
-        v, longest = self.s.outputs[5:10].copy(), 2e-2 * self.system.scales.time
+        v, longest = self.s.outputs.y[5:10].copy(), 2e-2 * self.system.scales.time
         speed = math.sqrt(self.system.mass @ v**2)
         if not speed or not self.rate:
             return 0.0
@@ -565,7 +563,7 @@ class Replay(Run):
 
     def _time_to_stop(self) -> float:
         """Time in which the motion would stop at its present deceleration [s]."""
-        v, acceleration = self.s.outputs[5:10], self.s.outputs[self.s.to.acceleration]
+        v, acceleration = self.s.outputs.y[5:10], self.s.outputs.acceleration
         slowing = -float((self.system.mass * v) @ acceleration)
         return float(self.system.mass @ v**2) / slowing if slowing > 0 else math.inf
 
@@ -682,7 +680,7 @@ class Replay(Run):
         if self._decide(turned, enters):
             return self.come_to_rest()
         self.observe()
-        ended, c_n = self._bridge(SETTLING), self.s.outputs[self.s.to.c_n]
+        ended, c_n = self._bridge(SETTLING), self.s.outputs.c_n
         # By more than rounding: phase 5 of leg 59 of seed 1128.
         if ended or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(BRIDGED)):
             return self.come_to_rest()
@@ -691,7 +689,7 @@ class Replay(Run):
             return self._hold()
         reserves, holders = self._measure_reserves(), self.mode.holders
         slipping = {holders[k][0] for k, reserve in reserves.items() if reserve < -ROUNDING_FORCE}
-        pulling: list[int] = np.flatnonzero(self.s.outputs[self.s.to.c_n] < -self.rounding).tolist()
+        pulling: list[int] = np.flatnonzero(self.s.outputs.c_n < -self.rounding).tolist()
         # Whether anything pulls where a contact slips by plan, its next formation says.
         if pulling and not slipping & self.slipping:
             return self.let_go(pulling)
@@ -765,7 +763,7 @@ class Replay(Run):
     def let_go(self, contacts: Sequence[int]) -> Ending:
         """End as contacts would have to pull: a release if that is planned of one of them."""
         names = self.formation.names
-        forces = dict(zip(names, self.s.outputs[self.s.to.c_n].tolist(), strict=True))
+        forces = dict(zip(names, self.s.outputs.c_n.tolist(), strict=True))
         pulling = [names[k] for k in contacts]
         if any(name in self.releasable for name in pulling):
             self._drop_repeated()
@@ -781,7 +779,7 @@ class Replay(Run):
         row = holders[min(planned or reserves, key=reserves.__getitem__)][0]
         if self.formation.names[row] in self.releasable:
             return self.let_go([row])
-        c_n, c_t = (float(s.outputs[part][row]) for part in (s.to.c_n, s.to.c_t))
+        c_n, c_t = (float(part[row]) for part in (s.outputs.c_n, s.outputs.c_t))
         if row in self.slipping:
             self._drop_repeated()
         return self.fail_by_slip(row, c_n, c_t)
@@ -837,7 +835,7 @@ class Replay(Run):
                 self.look()
                 return False
             self.records.pop()
-            self.coast(self.t + float(self.s.inputs[self.s.at.h]))
+            self.coast(self.t + float(self.s.inputs.h[0]))
         ended = self._decide(rows)
         if not ended:
             self.observe()

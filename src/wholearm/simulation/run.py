@@ -169,18 +169,17 @@ class Run(ABC):
         """Take the steps of some modes from here on, with their signs where they have any."""
         self.modes, degree = modes, self.torque.coefficients.shape[2] - 1
         self.s = build_stepper(self.system.structure, modes._replace(Xi=(), sigma=()), degree)
-        inputs, at = self.s.inputs, self.s.at
         self.s.load(self.system, self.tolerance, self.z)
         if modes.sigma:
-            inputs[at.Xi], inputs[at.sigma] = modes.Xi, modes.sigma
+            self.s.inputs.Xi[:], self.s.inputs.sigma[:] = modes.Xi, modes.sigma
         self.feed()
 
     def feed(self) -> None:
         """Hand the present state and torques to the steps."""
-        inputs, at = self.s.inputs, self.s.at
-        inputs[at.y], inputs[at.t] = self.y, self.t
-        inputs[at.piece] = self.torque.breaks[self.piece : self.piece + 2]
-        inputs[at.torque] = self.torque.coefficients[self.piece].ravel()
+        inputs = self.s.inputs
+        inputs.y[:], inputs.t[:] = self.y, self.t
+        inputs.piece[:] = self.torque.breaks[self.piece : self.piece + 2]
+        inputs.torque[:] = self.torque.coefficients[self.piece].ravel()
 
     def next_piece(self) -> bool:
         """Go on to the next piece of the torques, if there is one."""
@@ -209,21 +208,20 @@ class Run(ABC):
 
     def step_to(self, h: float) -> None:
         """Repeat the step with another length."""
-        self.s.inputs[self.s.at.h] = h
+        self.s.inputs.h[:] = h
         self.s.step()
         self.values = self.measure()
 
     def look(self) -> None:
         """Evaluate the present state."""
-        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, self.t
+        self.s.inputs.y[:], self.s.inputs.t[:] = self.y, self.t
         self.s.look()
         self.values = self.measure()
 
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t` [s], and record its end."""
-        s, self.t = self.s, t
-        self.y[:] = s.outputs[s.to.y]
-        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
+        self.t, self.y[:] = t, self.s.outputs.y
+        self.s.inputs.y[:], self.s.inputs.t[:] = self.y, t
         self.record()
 
     def find_first(self, h: float, among: slice = slice(None)) -> list[int]:
@@ -236,7 +234,7 @@ class Run(ABC):
         seen, done = list[int](), list[int]()
         last = -1
         while True:
-            if h != self.s.inputs[self.s.at.h]:
+            if h != self.s.inputs.h[0]:
                 self.step_to(h)
             after = self.values + shift
             low = [k for k in places[after[places] < 0].tolist() if k not in done]
@@ -271,7 +269,7 @@ class Run(ABC):
             h, whole = self.try_step(target)
             t = target if whole else self.t + h
             if rows := self.locate(h, t):
-                self.keep(self.t + float(self.s.inputs[self.s.at.h]))
+                self.keep(self.t + float(self.s.inputs.h[0]))
                 ending = self.handle(rows)
             else:
                 self.keep(t)
@@ -286,7 +284,6 @@ class Run(ABC):
         -------
         h, whole  its length [s] and whether it ends at `target`
         """
-        inputs, outputs, at, to = self.s.inputs, self.s.outputs, self.s.at, self.s.to
         remaining, time = target - self.t, self.system.scales.time
         self.start = self.values
         least = SHORTEST_STEP * max(time, abs(self.t))
@@ -294,9 +291,9 @@ class Run(ABC):
             h = min(self.h, self.longest)
             whole = h >= 0.999 * remaining
             h = remaining if whole else min(h, remaining / 2)
-            inputs[at.h] = h
+            self.s.inputs.h[:] = h
             self.s.step()
-            error = float(outputs[to.error])
+            error = float(self.s.outputs.error[0])
             if error <= 1:
                 self.values = self.measure()
                 # A growth of 40 at order 8 is that of an error of 1e-13 of the tolerance.
@@ -340,13 +337,12 @@ class Run(ABC):
             return
         none, tau = np.full(len(self.modes.kept), math.nan), self.tau(self.t)
         seen = self.y.copy(), np.zeros(self.system.n), tau, none, none
-        self.records.append(Record(self.t, self.phase_index, self.modes.kept, *seen, self.impact))
+        self.records.append(Record(self.t, self.phase_index, self.modes.kept, self.impact, *seen))
 
     def read_outputs(self, t: float) -> Record:
         """The outputs of the steps as a record at time `t` [s]."""
-        out, to, here = self.s.outputs.copy(), self.s.to, (t, self.phase_index, self.modes.kept)
-        state = out[to.y], out[to.acceleration], out[to.tau]
-        return Record(*here, *state, out[to.c_n], out[to.c_t], self.impact)
+        seen: Any = (part.copy() for part in self.s.outputs[:5])
+        return Record(t, self.phase_index, self.modes.kept, self.impact, *seen)
 
 
 @runtime_checkable

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -89,46 +90,44 @@ class Modes(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Where each input of a step is in its packed vector.
+    """What a step reads, as arrays or as symbols of their sizes.
 
     Those from `geometry` on are numbers of the system and its units.
     """
 
-    y: slice  # z, z' and the integrals, (2 n + LOSSES,)
-    t: int  # t, h [s]:
-    h: int
-    tolerance: int  # largest error of z and z' over the step, in units of the scene
-    Xi: slice  # Xi, sigma: directions of sliding (k,) and of coordinates (n,), zero where held
-    sigma: slice
-    stay: slice  # slip coordinates of what sticks [m], then held coordinates
-    piece: slice  # start and end of the torque's piece [s]
-    torque: slice  # its coefficients, joint by joint, as in `TorqueProfile`
-    geometry: slice
-    lift: slice  # diagonal of M^-1
-    applied: slice
-    viscous: slice
-    dry: slice
-    mu: slice  # of the kept pairs
-    units: slice  # of z and z'
-    scales: slice  # units of force and speed
-    friction_units: slice  # of the friction of coordinates
-    size: int
+    y: Expression  # z, z' and the integrals, (2 n + LOSSES,)
+    t: Expression  # t, h (1,) [s]:
+    h: Expression
+    tolerance: Expression  # (1,): largest error of z and z' over the step, in units of the scene
+    Xi: Expression  # Xi, sigma: directions of sliding (k,) and of coordinates (n,), zero where held
+    sigma: Expression
+    stay: Expression  # slip coordinates of what sticks [m], then held coordinates
+    piece: Expression  # start and end of the torque's piece [s]
+    torque: Expression  # its coefficients, joint by joint, as in `TorqueProfile`
+    geometry: Expression
+    applied: Expression
+    viscous: Expression
+    dry: Expression
+    units: Expression  # of z and z'
+    friction_units: Expression  # of the friction of coordinates
+    lift: Expression  # diagonal of M^-1
+    mu: Expression  # of the kept pairs
+    scales: Expression  # units of force and speed
 
 
 class Outputs(NamedTuple):
-    """Where each output of a step is in its packed vector; all but `error` hold at its end."""
+    """What a step gives; all but `error` and `stages` holds at its end."""
 
-    y: slice
-    acceleration: slice
-    c_n: slice  # c_n, c_t [N]: forces of the kept pairs
-    c_t: slice
-    tau: slice  # [N m]
-    ratio: int  # reduced inertia over that without friction
+    y: Array
+    acceleration: Array
+    tau: Array  # [N m]
+    c_n: Array  # c_n, c_t [N]: forces of the kept pairs
+    c_t: Array
+    ratio: Array  # (1,): reduced inertia over that without friction
     # positive until something happens, in units of the scene: see `EventRows`
-    values: slice
-    error: int  # estimated error over the tolerance; accept at 1 and below
-    stages: slice  # margins at the start and the stages of `INNER_STAGES`, one after the other
-    size: int
+    values: Array
+    error: Array  # (1,): estimated error over the tolerance; accept at 1 and below
+    stages: Array  # margins at the start and the stages of `INNER_STAGES`, one after the other
 
 
 class EventRows(NamedTuple):
@@ -147,26 +146,22 @@ class ModeStepper:
     """Compiled steps of one set of modes; calling `step` or `look` reads `inputs`."""
 
     modes: Modes  # without signs
-    inputs: Array  # inputs, outputs: packed vectors
-    outputs: Array
-    at: Inputs  # at, to, rows: their layouts
-    to: Outputs
+    inputs: Inputs
+    outputs: Outputs
     rows: EventRows
     step: Any  # step, look: a step of length h; the same outputs at the state given, without a step
     look: Any
 
     def load(self, system: System, tolerance: float, z: Array) -> None:
         """Set the inputs that do not change along a motion, which keeps what sticks as at z."""
-        inputs, at = self.inputs, self.at
-        inputs[at.tolerance] = tolerance
-        inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
-        inputs[at.applied], inputs[at.viscous] = system.applied, system.viscous
-        inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(self.modes.kept)]
-        inputs[at.units] = system.units
-        inputs[at.scales] = system.scales.force, system.scales.speed
-        inputs[at.friction_units] = system.friction_units
+        inputs = self.inputs
+        for name in ("geometry", "applied", "viscous", "dry", "units", "friction_units"):
+            getattr(inputs, name)[:] = getattr(system, name)
+        inputs.tolerance[:], inputs.lift[:] = tolerance, 1 / system.mass
+        inputs.mu[:] = system.friction[list(self.modes.kept)]
+        inputs.scales[:] = system.scales.force, system.scales.speed
         slip = system.evaluate(z, z, [pairs[0] for pairs in self.modes.stuck]).slip
-        inputs[at.stay] = np.concatenate([slip, z[list(self.modes.held)]])
+        inputs.stay[:] = np.concatenate([slip, z[list(self.modes.held)]])
 
 
 @lru_cache(maxsize=256)
@@ -176,7 +171,7 @@ def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeSteppe
 
 
 class _Equations:
-    """Equations of motion, as expressions of one packed vector."""
+    """Equations of motion, as expressions of the inputs."""
 
     def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
         self.structure, self.modes, self.n = structure, modes, structure.n
@@ -184,42 +179,47 @@ class _Equations:
         self.contact_rows = structure.build_rows(modes.kept, self.v)
         self.groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
         n, k, s = self.n, len(modes.kept), len(modes.stuck) + len(modes.held)
-        size, g = 2 * n + LOSSES, structure.geometry.shape[0]
-        numbers = (g, n, n, n, n, k, 2 * n, 2, n)
-        self.at = Inputs(*_lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
-        self.rows = EventRows(*_lay_out(k, 2 * s, k, n))
-        seen = (1 + len(INNER_STAGES)) * self.rows.cone.stop
-        self.to = Outputs(*_lay_out(size, n, k, k, 2, None, self.rows.size, None, seen))
+        numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
+        sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
+        self.sizes = dict(zip(Inputs._fields, sizes, strict=True))
+        ends = np.cumsum([0, k, 2 * s, k, n]).tolist()
+        force, cone, slide, turn = (slice(*pair) for pair in pairwise(ends))
+        self.rows = EventRows(force, cone, slide, turn, ends[-1])
 
     def compile(self) -> ModeStepper:
-        """Steps, and looks at a state, as functions of the packed inputs."""
-        at, n = self.at, self.n
+        """Steps, and looks at a state, as functions of the inputs."""
+        n = self.n
         stage, report = self._build_motion()
-        packed = ca.MX.sym("packed", at.size)
-        y, t, h, geometry = packed[at.y], packed[at.t], packed[at.h], packed[at.geometry]
+        x = Inputs(**{name: ca.MX.sym(name, size) for name, size in self.sizes.items()})
         stages: list[Expression] = []
 
         def rate(state: Expression, time: Expression) -> Expression:
-            rates, margins = stage(state, time, packed, geometry)
+            rates, margins = stage(*x._replace(y=state, t=time))
             stages.append(margins)
             return rates
 
-        end, fifth, third = build_step(rate, y, t, h, 2 * n)
-        error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
-        inner = ca.vertcat(*(stages[row] for row in INNER_STAGES))
-        seen = (error, stages[0], inner)
-        end = ca.vertcat(self._build_projection()(end[: 2 * n], packed), end[2 * n :])
+        end, fifth, third = build_step(rate, x.y, x.t, x.h, 2 * n)
+        error = build_error(fifth, third, x.y[: 2 * n], x.units, x.tolerance)
+        seen = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
+        end = ca.vertcat(self._build_projection()(*x._replace(y=end[: 2 * n])), end[2 * n :])
         functions = []
         for state, time, extra in (
-            (end, t + h, seen),
-            (y, t, (0, ca.DM.zeros(stages[0].shape[0] + inner.shape[0]))),
+            (end, x.t + x.h, (error, seen)),
+            (x.y, x.t, (0, ca.DM.zeros(seen.shape[0]))),
         ):
-            parts = report(state[: 2 * n], time, packed, geometry)
-            outputs = ca.densify(ca.vertcat(state, parts, *extra))
-            functions.append(ca.Function("step", [packed], [outputs]))
-        inputs, outputs = np.zeros(at.size), np.zeros(self.to.size)
-        step, look = (bind(function, [inputs], [outputs]) for function in functions)
-        return ModeStepper(self.modes, inputs, outputs, at, self.to, self.rows, step, look)
+            parts = report(*x._replace(y=state[: 2 * n], t=time))
+            every = [ca.densify(part) for part in (state, *parts, *extra)]
+            functions.append(ca.Function("step", [*x], every))
+        inputs = Inputs(**{name: np.zeros(size) for name, size in self.sizes.items()})
+        outputs = Outputs(*(np.zeros(part.shape[0]) for part in every))
+        step, look = (bind(function, inputs, outputs) for function in functions)
+        return ModeStepper(self.modes, inputs, outputs, self.rows, step, look)
+
+    def _name_inputs(self) -> Inputs:
+        """Symbols of the inputs, with z and z' alone as the state."""
+        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
+        state = ca.vertcat(self.structure.z, self.v)
+        return Inputs(**symbols)._replace(y=state, geometry=self.structure.geometry)
 
     def _stack(self, normal: Expression, tangential: Expression) -> Expression:
         """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
@@ -227,28 +227,26 @@ class _Equations:
         return ca.vertcat(normal, *(tangential[rows[0], :] for rows in self.groups), hold)
 
     def _build_motion(self) -> tuple[Expression, Expression]:
-        """CasADi functions of state, time, packed inputs and geometry.
+        """CasADi functions of the inputs.
 
         The first one returns rates of the state and margins; the second one the outputs from the
         acceleration to the event values.
         """
-        structure, n, at, groups = self.structure, self.n, self.at, self.groups
+        structure, n, groups, x = self.structure, self.n, self.groups, self._name_inputs()
         k, held = len(self.modes.kept), list(self.modes.held)
-        z, v, time = structure.z, self.v, ca.SX.sym("time")
-        packed = ca.SX.sym("packed", at.size)
-        mu, sigma, lift = packed[at.mu], packed[at.sigma], packed[at.lift]
+        v, mu, sigma, lift = self.v, x.mu, x.sigma, x.lift
         slides = np.ones(k)
         slides[[row for rows in groups for row in rows]] = 0.0
-        rub = mu * packed[at.Xi] * ca.DM(slides)
+        rub = mu * x.Xi * ca.DM(slides)
         _, _, A, A_t, bend, bend_t = self.contact_rows
         P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
         curve = ca.vertcat(bend, *(bend_t[rows[0]] for rows in groups), ca.DM(len(held), 1))
-        tau = _build_torque(time, packed[at.piece], packed[at.torque])
-        viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
+        tau = _build_torque(x.t, x.piece, x.torque)
+        viscous, dry = x.viscous * v, x.dry * sigma
         drive = ca.SX(n, 1)
         for row, coordinate in enumerate(structure.driven):
             drive[coordinate] = tau[row]
-        force, c, ratio = packed[at.applied] + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
+        force, c, ratio = x.applied + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
         if P.shape[0]:
             lifted = P * ca.repmat(lift.T, P.shape[0], 1)
             K = lifted @ G.T
@@ -259,49 +257,44 @@ class _Equations:
         losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
         losses.append(ca.dot(rub * c_n, v_t))
         bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups]
-        bounds += [packed[at.dry][i] for i in held]
-        units = [packed[at.scales][0]] * len(groups) + [packed[at.friction_units][i] for i in held]
+        bounds += [x.dry[i] for i in held]
+        units = [x.scales[0]] * len(groups) + [x.friction_units[i] for i in held]
         bound, unit = (ca.vertcat(ca.SX(0, 1), *part) for part in (bounds, units))
-        margins = ca.vertcat(c_n / packed[at.scales][0], (bound - f) / unit, (bound + f) / unit)
-        speeds = packed[at.Xi] * v_t / packed[at.scales][1], sigma * v / packed[at.units][n:]
+        margins = ca.vertcat(c_n / x.scales[0], (bound - f) / unit, (bound + f) / unit)
+        speeds = x.Xi * v_t / x.scales[1], sigma * v / x.units[n:]
         c_t = -rub * c_n
         for rows, friction in zip(groups, ca.vertsplit(f)[: len(groups)], strict=True):
             share = c_n[rows] / ca.fmax(ca.sum1(c_n[rows]), 1e-300) if len(rows) > 1 else 1
             c_t[rows] = friction * share
-        inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
         stage = [ca.vertcat(v, acceleration, *losses), margins]
-        report = [ca.vertcat(acceleration, c_n, c_t, tau, ratio, margins, *speeds)]
+        report = [acceleration, tau, c_n, c_t, ratio, ca.vertcat(margins, *speeds)]
         return (
-            ca.Function("stage", inputs, [ca.densify(part) for part in stage]),
-            ca.Function("report", inputs, [ca.densify(part) for part in report]),
+            ca.Function("stage", [*x], [ca.densify(part) for part in stage]),
+            ca.Function("report", [*x], [ca.densify(part) for part in report]),
         )
 
     def _build_projection(self) -> Expression:
-        """CasADi function (state, packed) -> its projection on the constraints in the metric M.
+        """CasADi function of the inputs: the projection of z, z' on the constraints, in metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        structure, n, z, v = self.structure, self.n, self.structure.z, self.v
-        packed = ca.SX.sym("packed", self.at.size)
+        n, x = self.n, self._name_inputs()
         gap, slip, A, A_t, _, _ = self.contact_rows
-        P, state = self._stack(A, A_t), ca.vertcat(z, v)
+        P = self._stack(A, A_t)
         if not P.shape[0]:
-            return ca.Function("correct", [state, packed], [state])
-        places = ca.vertcat(
-            gap, *(slip[rows[0]] for rows in self.groups), *(z[i] for i in self.modes.held)
-        )
-        wanted = ca.vertcat(ca.DM(len(self.modes.kept), 1), packed[self.at.stay])
-        rows = ca.Function(
-            "rows", [z, packed, structure.geometry], [ca.densify(P), ca.densify(places - wanted)]
-        )
+            return ca.Function("correct", [*x], [x.y])
+        stays = [*(slip[rows[0]] for rows in self.groups), *(x.y[i] for i in self.modes.held)]
+        off = ca.vertcat(gap, ca.vertcat(ca.SX(0, 1), *stays) - x.stay)
+        rows = ca.Function("rows", [*x], [ca.densify(P), ca.densify(off)])
         correct = _build_correction(*P.shape)
-        y, inputs = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
-        geometry, lift = inputs[self.at.geometry], inputs[self.at.lift]
-        P, off = rows(y[:n], inputs, geometry)
-        place = y[:n] - correct(P, off, lift)
-        P, _ = rows(place, inputs, geometry)
-        speed = y[n:] - correct(P, P @ y[n:], lift)
-        return ca.Function("project", [y, inputs], [ca.vertcat(place, speed)])
+        x = Inputs(**{name: ca.MX.sym(name, size) for name, size in self.sizes.items()})
+        x = x._replace(y=ca.MX.sym("y", 2 * n))
+        P, off = rows(*x)
+        place, speed = x.y[:n] - correct(P, off, x.lift), x.y[n:]
+        P, _ = rows(*x._replace(y=ca.vertcat(place, speed)))
+        return ca.Function(
+            "project", [*x], [ca.vertcat(place, speed - correct(P, P @ speed, x.lift))]
+        )
 
 
 @lru_cache(maxsize=16)
@@ -321,16 +314,6 @@ def _build_torque(time: Expression, piece: Expression, coefficients: Expression)
     for power in range(coefficients.shape[0] - 2, -1, -1):
         value = value * x + coefficients[power, :]
     return value.T
-
-
-def _lay_out(*sizes: int | None) -> tuple[Any, ...]:
-    """Consecutive slices of the given sizes, an index where None is given, and the total."""
-    places: list[Any] = []
-    stop = 0
-    for size in sizes:
-        places.append(stop if size is None else slice(stop, stop + size))
-        stop += 1 if size is None else size
-    return (*places, stop)
 
 
 def build_step(
