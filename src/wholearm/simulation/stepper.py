@@ -182,6 +182,9 @@ class _Equations:
         numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
         sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
         self.sizes = dict(zip(Inputs._fields, sizes, strict=True))
+        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
+        symbols |= {"y": ca.vertcat(structure.z, self.v), "geometry": structure.geometry}
+        self.x = Inputs(**symbols)
         ends = np.cumsum([0, k, 2 * s, k, n]).tolist()
         force, cone, slide, turn = (slice(*pair) for pair in pairwise(ends))
         self.rows = EventRows(force, cone, slide, turn, ends[-1])
@@ -201,7 +204,7 @@ class _Equations:
         end, fifth, third = build_step(rate, x.y, x.t, x.h, 2 * n)
         error = build_error(fifth, third, x.y[: 2 * n], x.units, x.tolerance)
         seen = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
-        end = ca.vertcat(self._build_projection()(*x._replace(y=end[: 2 * n])), end[2 * n :])
+        end = ca.vertcat(self._project(x._replace(y=end[: 2 * n])), end[2 * n :])
         functions = []
         for state, time, extra in (
             (end, x.t + x.h, (error, seen)),
@@ -215,12 +218,6 @@ class _Equations:
         step, look = (bind(function, inputs, outputs) for function in functions)
         return ModeStepper(self.modes, inputs, outputs, self.rows, step, look)
 
-    def _name_inputs(self) -> Inputs:
-        """Symbols of the inputs, with z and z' alone as the state."""
-        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
-        state = ca.vertcat(self.structure.z, self.v)
-        return Inputs(**symbols)._replace(y=state, geometry=self.structure.geometry)
-
     def _stack(self, normal: Expression, tangential: Expression) -> Expression:
         """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
         hold = ca.DM(np.eye(self.n)[list(self.modes.held)].reshape(-1, self.n))
@@ -232,7 +229,7 @@ class _Equations:
         The first one returns rates of the state and margins; the second one the outputs from the
         acceleration to the event values.
         """
-        structure, n, groups, x = self.structure, self.n, self.groups, self._name_inputs()
+        structure, n, groups, x = self.structure, self.n, self.groups, self.x
         k, held = len(self.modes.kept), list(self.modes.held)
         v, mu, sigma, lift = self.v, x.mu, x.sigma, x.lift
         slides = np.ones(k)
@@ -248,11 +245,8 @@ class _Equations:
             drive[coordinate] = tau[row]
         force, c, ratio = x.applied + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
         if P.shape[0]:
-            lifted = P * ca.repmat(lift.T, P.shape[0], 1)
-            K = lifted @ G.T
-            c = ca.solve(K, -curve - lifted @ force)
+            c, ratio = _build_solution(*P.shape)(P, G, lift, force, curve)
             force = force + G.T @ c
-            ratio = ca.det(K) / ca.det(lifted @ P.T)
         acceleration, v_t, (c_n, f) = lift * force, A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
         losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
         losses.append(ca.dot(rub * c_n, v_t))
@@ -273,28 +267,36 @@ class _Equations:
             ca.Function("report", [*x], [ca.densify(part) for part in report]),
         )
 
-    def _build_projection(self) -> Expression:
-        """CasADi function of the inputs: the projection of z, z' on the constraints, in metric M.
+    def _project(self, at: Inputs) -> Expression:
+        """The projection of z and z' at some inputs on the constraints, in the metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        n, x = self.n, self._name_inputs()
+        n, x = self.n, self.x
         gap, slip, A, A_t, _, _ = self.contact_rows
         P = self._stack(A, A_t)
         if not P.shape[0]:
-            return ca.Function("correct", [*x], [x.y])
+            return at.y
         stays = [*(slip[rows[0]] for rows in self.groups), *(x.y[i] for i in self.modes.held)]
         off = ca.vertcat(gap, ca.vertcat(ca.SX(0, 1), *stays) - x.stay)
-        rows = ca.Function("rows", [*x], [ca.densify(P), ca.densify(off)])
-        correct = _build_correction(*P.shape)
-        x = Inputs(**{name: ca.MX.sym(name, size) for name, size in self.sizes.items()})
-        x = x._replace(y=ca.MX.sym("y", 2 * n))
-        P, off = rows(*x)
-        place, speed = x.y[:n] - correct(P, off, x.lift), x.y[n:]
-        P, _ = rows(*x._replace(y=ca.vertcat(place, speed)))
-        return ca.Function(
-            "project", [*x], [ca.vertcat(place, speed - correct(P, P @ speed, x.lift))]
-        )
+        inputs = [self.structure.z, x.stay, x.geometry]
+        rows = ca.Function("rows", inputs, [ca.densify(P), ca.densify(off)])
+        correct, speed = _build_correction(*P.shape), at.y[n:]
+        P, off = rows(at.y[:n], at.stay, at.geometry)
+        place = at.y[:n] - correct(P, off, at.lift)
+        P, _ = rows(place, at.stay, at.geometry)
+        return ca.vertcat(place, speed - correct(P, P @ speed, at.lift))
+
+
+@lru_cache(maxsize=16)
+def _build_solution(count: int, n: int) -> Expression:
+    """CasADi function (P, G, diagonal of M^-1, force, P' z') -> c, and the ratio of inertias."""
+    P, G, lift = ca.SX.sym("P", count, n), ca.SX.sym("G", count, n), ca.SX.sym("lift", n)
+    force, curve = ca.SX.sym("force", n), ca.SX.sym("curve", count)
+    lifted = P * ca.repmat(lift.T, count, 1)
+    K = lifted @ G.T
+    c, ratio = ca.solve(K, -curve - lifted @ force), ca.det(K) / ca.det(lifted @ P.T)
+    return ca.Function("solution", [P, G, lift, force, curve], [c, ratio])
 
 
 @lru_cache(maxsize=16)
@@ -310,10 +312,7 @@ def _build_torque(time: Expression, piece: Expression, coefficients: Expression)
     start, stop = piece[0], piece[1]
     x = (2 * time - start - stop) / (stop - start)
     coefficients = ca.reshape(coefficients, -1, 2)
-    value = coefficients[-1, :]
-    for power in range(coefficients.shape[0] - 2, -1, -1):
-        value = value * x + coefficients[power, :]
-    return value.T
+    return ca.vertcat(*(ca.polyval(part[::-1], x) for part in ca.horzsplit(coefficients)))
 
 
 def build_step(
@@ -327,34 +326,24 @@ def build_step(
 
     Components of y (n,) from `moving` on are integrals along the motion; errors do not cover them.
     """
-    stages, last = _build_combinations(y.shape[0], moving)
     rates: list[Expression] = []
-    for combine, row in zip(stages, ROWS, strict=True):
-        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y[:moving], t)
-        rates.append(rate(*place))
-    end, fifth, third = last(y, t, h, *rates)
-    return end, fifth, third
+
+    def combine(start: Expression, weights: dict[int, float]) -> Expression:
+        function = _build_combination(y.shape[0], tuple(weights.values()))
+        return function(start, h, *(rates[stage] for stage in weights))
+
+    for time, row in zip(ca.vertsplit(t + h * ca.DM(NODES)), ROWS, strict=True):
+        rates.append(rate(combine(y, row)[:moving], time))
+    return combine(y, WEIGHTS), combine(0, ERROR_5)[:moving], combine(0, ERROR_3)[:moving]
 
 
-@lru_cache(maxsize=8)
-def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expression]:
-    """CasADi functions of y, t, h and rates of stages, for any right-hand side of length n.
-
-    Those of the stages return state and time of each stage, the last one the end and both errors.
-    """
-    y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
-    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(ROWS))]
-
-    def combine(weights: dict[int, float], count: int = n) -> Expression:
-        used = ca.horzcat(ca.SX(count, 0), *(rates[stage][:count] for stage in weights))
-        return h * (used @ ca.DM(list(weights.values())))
-
-    stages = []
-    for node, row in zip(NODES, ROWS, strict=True):
-        place = [y[:moving] + combine(row, moving), t + node * h]
-        stages.append(ca.Function("stage", [y, t, h, *(rates[j] for j in row)], place))
-    ends = [y + combine(WEIGHTS), combine(ERROR_5, moving), combine(ERROR_3, moving)]
-    return stages, ca.Function("last", [y, t, h, *rates], ends)
+@lru_cache(maxsize=128)
+def _build_combination(n: int, weights: tuple[float, ...]) -> Expression:
+    """CasADi function of a start (n,), h and rates (n,) each -> the start + h (weighted rates)."""
+    start, h = ca.SX.sym("start", n), ca.SX.sym("h")
+    rates = [ca.SX.sym("rate", n) for _ in weights]
+    end = start + h * (ca.horzcat(ca.SX(n, 0), *rates) @ ca.DM(weights))
+    return ca.Function("combine", [start, h, *rates], [end])
 
 
 def build_error(
