@@ -365,6 +365,7 @@ class FreeRun(Run):
     level: Array  # (N,) [m]: gap at which a pair that touches closes
     before: StepEnd
     after: StepEnd
+    shift = np.zeros(0)  # (m,): how far below zero each event value has to fall
 
     def __init__(
         self,
@@ -732,7 +733,7 @@ class FreeRun(Run):
         self.load(self.modes)
         rows, self.kept = self.s.rows, list(self.modes.kept)
         self.watched = ~np.isin(range(len(self.system.names)), self.kept)
-        self.counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        self.counts = [rows.cone.stop, rows.turn.stop - rows.cone.stop, len(self.kept)]
         self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
         self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
@@ -740,7 +741,7 @@ class FreeRun(Run):
         sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
         self.level = np.where(gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
-        self.floor = np.maximum(self.slack, self.slack - self.values)
+        self.shift = np.maximum(self.slack, self.slack - self.values)
         self.h = min(self.h, self._time_to_return())
         self.record()
         super().move()
@@ -765,16 +766,11 @@ class FreeRun(Run):
         self.after = StepEnd(motion, *self.system.look(motion[0]))
         return np.concatenate([out.values, self.after.ranges[self.kept] / self.unit])
 
-    @property
-    def shift(self) -> Array:
-        """Values that start below zero may stay there: modes are judged a moment later."""
-        return self.floor
-
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
         self._advance()
-        self.floor = np.where(self.values > 0, self.slack, self.floor)
+        self.shift = np.where(self.values > 0, self.slack, self.shift)
 
     def handle(self, found: list[int]) -> bool:
         """End the motion at an event."""

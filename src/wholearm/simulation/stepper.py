@@ -138,7 +138,6 @@ class EventRows(NamedTuple):
     cone: slice
     slide: slice  # slide, turn: sliding velocities times Xi, rates of coordinates times sigma
     turn: slice
-    size: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +186,7 @@ class _Equations:
         self.x = Inputs(**symbols)
         ends = np.cumsum([0, k, 2 * s, k, n]).tolist()
         force, cone, slide, turn = (slice(*pair) for pair in pairwise(ends))
-        self.rows = EventRows(force, cone, slide, turn, ends[-1])
+        self.rows = EventRows(force, cone, slide, turn)
 
     def compile(self) -> ModeStepper:
         """Steps, and looks at a state, as functions of the inputs."""
