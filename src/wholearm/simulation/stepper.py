@@ -180,10 +180,9 @@ class _Equations:
         n, k, s = self.n, len(modes.kept), len(modes.stuck) + len(modes.held)
         numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
         sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
-        self.sizes = dict(zip(Inputs._fields, sizes, strict=True))
-        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
-        symbols |= {"y": ca.vertcat(structure.z, self.v), "geometry": structure.geometry}
-        self.x = Inputs(**symbols)
+        self.ends = np.cumsum([0, *sizes]).tolist()
+        x = Inputs(*map(ca.SX.sym, Inputs._fields, sizes))
+        self.x = x._replace(geometry=structure.geometry)
         ends = np.cumsum([0, k, 2 * s, k, n]).tolist()
         force, cone, slide, turn = (slice(*pair) for pair in pairwise(ends))
         self.rows = EventRows(force, cone, slide, turn)
@@ -192,30 +191,31 @@ class _Equations:
         """Steps, and looks at a state, as functions of the inputs."""
         n = self.n
         stage, report = self._build_motion()
-        x = Inputs(**{name: ca.MX.sym(name, size) for name, size in self.sizes.items()})
-        stages: list[Expression] = []
+        # One vector takes less time than many.
+        packed = ca.MX.sym("inputs", self.ends[-1])
+        x, stages = Inputs(*ca.vertsplit(packed, self.ends)), list[Expression]()
 
         def rate(state: Expression, time: Expression) -> Expression:
-            rates, margins = stage(*x._replace(y=state, t=time))
+            rates, margins = stage(state, time, packed)
             stages.append(margins)
             return rates
 
         end, fifth, third = build_step(rate, x.y, x.t, x.h, 2 * n)
         error = build_error(fifth, third, x.y[: 2 * n], x.units, x.tolerance)
         seen = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
-        end = ca.vertcat(self._project(x._replace(y=end[: 2 * n])), end[2 * n :])
-        functions = []
+        end = ca.vertcat(self._project(x, end[: 2 * n]), end[2 * n :])
+        inputs, functions = np.zeros(self.ends[-1]), []
         for state, time, extra in (
             (end, x.t + x.h, (error, seen)),
             (x.y, x.t, (0, ca.DM.zeros(seen.shape[0]))),
         ):
-            parts = report(*x._replace(y=state[: 2 * n], t=time))
-            every = [ca.densify(part) for part in (state, *parts, *extra)]
-            functions.append(ca.Function("step", [*x], every))
-        inputs = Inputs(**{name: np.zeros(size) for name, size in self.sizes.items()})
-        outputs = Outputs(*(np.zeros(part.shape[0]) for part in every))
-        step, look = (bind(function, inputs, outputs) for function in functions)
-        return ModeStepper(self.modes, inputs, outputs, self.rows, step, look)
+            every = [state, *report(state[: 2 * n], time, packed), *map(ca.MX, extra)]
+            functions.append(ca.Function("step", [packed], [ca.densify(ca.vertcat(*every))]))
+        stops = np.cumsum([part.shape[0] for part in every])
+        outputs = np.zeros(stops[-1])
+        step, look = (bind(function, [inputs], [outputs]) for function in functions)
+        views = Inputs(*np.split(inputs, self.ends[1:-1])), Outputs(*np.split(outputs, stops[:-1]))
+        return ModeStepper(self.modes, *views, self.rows, step, look)
 
     def _stack(self, normal: Expression, tangential: Expression) -> Expression:
         """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
@@ -223,21 +223,21 @@ class _Equations:
         return ca.vertcat(normal, *(tangential[rows[0], :] for rows in self.groups), hold)
 
     def _build_motion(self) -> tuple[Expression, Expression]:
-        """CasADi functions of the inputs.
+        """CasADi functions of z and z', the time and the inputs in one column.
 
         The first one returns rates of the state and margins; the second one the outputs from the
         acceleration to the event values.
         """
         structure, n, groups, x = self.structure, self.n, self.groups, self.x
         k, held = len(self.modes.kept), list(self.modes.held)
-        v, mu, sigma, lift = self.v, x.mu, x.sigma, x.lift
+        v, mu, sigma, lift, time = self.v, x.mu, x.sigma, x.lift, ca.SX.sym("time")
         slides = np.ones(k)
         slides[[row for rows in groups for row in rows]] = 0.0
         rub = mu * x.Xi * ca.DM(slides)
         _, _, A, A_t, bend, bend_t = self.contact_rows
         P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
         curve = ca.vertcat(bend, *(bend_t[rows[0]] for rows in groups), ca.DM(len(held), 1))
-        tau = _build_torque(x.t, x.piece, x.torque)
+        tau = _build_torque(time, x.piece, x.torque)
         viscous, dry = x.viscous * v, x.dry * sigma
         drive = ca.SX(n, 1)
         for row, coordinate in enumerate(structure.driven):
@@ -261,28 +261,28 @@ class _Equations:
             c_t[rows] = friction * share
         stage = [ca.vertcat(v, acceleration, *losses), margins]
         report = [acceleration, tau, c_n, c_t, ratio, ca.vertcat(margins, *speeds)]
+        inputs = [ca.vertcat(structure.z, v), time, ca.vertcat(*x)]
         return (
-            ca.Function("stage", [*x], [ca.densify(part) for part in stage]),
-            ca.Function("report", [*x], [ca.densify(part) for part in report]),
+            ca.Function("stage", inputs, [ca.densify(part) for part in stage]),
+            ca.Function("report", inputs, [ca.densify(part) for part in report]),
         )
 
-    def _project(self, at: Inputs) -> Expression:
-        """The projection of z and z' at some inputs on the constraints, in the metric M.
+    def _project(self, at: Inputs, state: Expression) -> Expression:
+        """The projection of z and z', with some inputs, on the constraints, in the metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        n, x = self.n, self.x
+        n, x, z = self.n, self.x, self.structure.z
         gap, slip, A, A_t, _, _ = self.contact_rows
         P = self._stack(A, A_t)
         if not P.shape[0]:
-            return at.y
-        stays = [*(slip[rows[0]] for rows in self.groups), *(x.y[i] for i in self.modes.held)]
+            return state
+        stays = [*(slip[rows[0]] for rows in self.groups), *(z[i] for i in self.modes.held)]
         off = ca.vertcat(gap, ca.vertcat(ca.SX(0, 1), *stays) - x.stay)
-        inputs = [self.structure.z, x.stay, x.geometry]
-        rows = ca.Function("rows", inputs, [ca.densify(P), ca.densify(off)])
-        correct, speed = _build_correction(*P.shape), at.y[n:]
-        P, off = rows(at.y[:n], at.stay, at.geometry)
-        place = at.y[:n] - correct(P, off, at.lift)
+        rows = ca.Function("rows", [z, x.stay, x.geometry], [ca.densify(P), ca.densify(off)])
+        correct, speed = _build_correction(*P.shape), state[n:]
+        P, off = rows(state[:n], at.stay, at.geometry)
+        place = state[:n] - correct(P, off, at.lift)
         P, _ = rows(place, at.stay, at.geometry)
         return ca.vertcat(place, speed - correct(P, P @ speed, at.lift))
 
@@ -327,22 +327,25 @@ def build_step(
     """
     rates: list[Expression] = []
 
-    def combine(start: Expression, weights: dict[int, float]) -> Expression:
-        function = _build_combination(y.shape[0], tuple(weights.values()))
+    def combine(start: Expression, weights: dict[int, float], count: int = moving) -> Expression:
+        function = _build_combination(y.shape[0], count, tuple(weights.values()))
         return function(start, h, *(rates[stage] for stage in weights))
 
     for time, row in zip(ca.vertsplit(t + h * ca.DM(NODES)), ROWS, strict=True):
-        rates.append(rate(combine(y, row)[:moving], time))
-    return combine(y, WEIGHTS), combine(0, ERROR_5)[:moving], combine(0, ERROR_3)[:moving]
+        rates.append(rate(combine(y, row), time))
+    return combine(y, WEIGHTS, y.shape[0]), combine(0, ERROR_5), combine(0, ERROR_3)
 
 
 @lru_cache(maxsize=128)
-def _build_combination(n: int, weights: tuple[float, ...]) -> Expression:
-    """CasADi function of a start (n,), h and rates (n,) each -> the start + h (weighted rates)."""
+def _build_combination(n: int, count: int, weights: tuple[float, ...]) -> Expression:
+    """CasADi function of a start (n,), h and rates (n,) each -> the start + h (weighted rates).
+
+    Of its components the first `count` are computed.
+    """
     start, h = ca.SX.sym("start", n), ca.SX.sym("h")
     rates = [ca.SX.sym("rate", n) for _ in weights]
     end = start + h * (ca.horzcat(ca.SX(n, 0), *rates) @ ca.DM(weights))
-    return ca.Function("combine", [start, h, *rates], [end])
+    return ca.Function("combine", [start, h, *rates], [end[:count]])
 
 
 def build_error(
