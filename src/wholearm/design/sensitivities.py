@@ -154,13 +154,14 @@ def _evaluate_path(
     """Terms of a solution along other curves, on elements between the same reversals."""
     task, nlp, units, made = iterate.task, iterate.nlp, iterate.units, iterate.solution
     parts = list[path_data.PhaseData]()
-    for part, curve, phase in zip(iterate.parts, curves, task.phases, strict=True):
+    last = len(curves) - 1
+    for k, (part, curve, phase) in enumerate(zip(iterate.parts, curves, task.phases, strict=True)):
         old, new = ([0.0, *(s.stop for s in each.segments)] for each in (part.curve, curve))
         if len(old) != len(new):
             raise SolverError(f"in phase {phase} a reversal comes or goes")
         edges, grid = np.interp(part.grid.edges, old, new), part.grid
         segment = grid.segment[:: path_motion.NODES]
-        moved = path_motion.lay_out(edges, segment, grid.rests, grid.held)
+        moved = path_motion.lay_out(edges, segment, (k == 0, k == last), task.is_held)
         parts.append(path_data.prepare(curve, epsilon, moved, phase))
     data = path_data.join(parts)
     x = path_plan.pack(nlp, made.profile, units, made.margin, iterate.data.grid.sizes)

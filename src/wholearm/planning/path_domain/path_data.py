@@ -221,9 +221,7 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         grid=Grid(
             chain((part.grid.s for part in parts), starts),
             chain((part.grid.segment for part in parts), segments),
-            (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
-            parts[0].grid.held,
-            np.concatenate([part.grid.bends for part in parts]),
+            np.concatenate([part.grid.maps for part in parts]),
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),

@@ -1,12 +1,12 @@
 """Motion along a curve: elements with polynomials of s'' and internal force, and s(t).
 
-An element has `NODES` nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
-motion s is linear in y. Next to rest s is quadratic in y, measured from the place of rest: the
-speed, and viscous friction with it, is the root of s there, and smooth in y. Where torques may not
-step, the motion starts and ends without acceleration and s is cubic in y. Elements after such a
-start are bent: s is (1 - c) y + c y^2 of the length, with c such that the root of the distance from
-a virtual start with acceleration is linear in y; c is negative before such an end. With b = s'^2
-and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
+An element has `NODES` nodes, the Lobatto points of a local variable y from 0 to 1, and a map: s is
+a polynomial of y. Inside a motion it is linear. Next to rest it is quadratic, measured from the
+place of rest: the speed, and viscous friction with it, is the root of s there, and smooth in y.
+Where torques may not step, the motion starts and ends without acceleration and s is cubic in y.
+Elements after such a start are bent: s is (1 - c) y + c y^2 of the length, with c such that the
+root of the distance from a virtual start with acceleration is linear in y; c is negative before
+such an end. With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
 
 Inside an element s(t) follows by Gauss quadrature of 1 / s'. z, tau and the contact forces follow
 from s, s' and s'' by inverse dynamics: the equations of motion hold at every instant.
@@ -16,47 +16,49 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from ...common.arrays import Array, Numbers, jacobi_nodes
+from ...common.arrays import Array, Flags, Numbers, jacobi_nodes
 from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.trajectory import Samples
 
 DEGREE = 4  # degree of the polynomials
 NODES = DEGREE + 1  # of an element
-# Kinds of elements: amid a motion, at its start and end, and there without acceleration.
-INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = range(5)
-POWERS = np.array([1, 2, 2, 3, 3])  # power of y in s, of each kind
-SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])  # sign of dy/dt in each kind
+POWERS = np.arange(NODES)
+# Maps, by the coefficients of y, y^2 and y^3: amid a motion, after rest, and so without
+# acceleration; and what runs a map through backwards, 1 - map(1 - y).
+INSIDE, FROM_REST, FROM_HOLD = np.eye(3)
+BACKWARDS = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, -3.0], [0.0, 0.0, 1.0]])
 
 
 class Basis(NamedTuple):
-    """Polynomial basis of each kind of element, from values at its nodes."""
+    """Polynomial basis of an element, from values at its nodes."""
 
-    y: Array  # (5, p + 1): the nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0
-    to_powers: Array  # (5, p + 1, p + 1): coefficients of powers of y
-    links: Array  # (5, p, p + 1): rise of b between nodes, over the element's length, from s''
+    y: Array  # (p + 1,): the nodes, from 0 to 1
+    to_powers: Array  # (p + 1, p + 1): coefficients of powers of y
+    slopes: Array  # (p + 1, p + 1): derivatives over y at the nodes
+    # (3, p, p + 1): rise of b between nodes, over the element's length, from s'', for each power of
+    # y in the map
+    links: Array
     weights: Array  # (p + 1,): of Lobatto's quadrature over y
-    modes: Array  # (p + 1, p + 1): Legendre coefficients in an element amid a motion
+    modes: Array  # (p + 1, p + 1): Legendre coefficients
 
 
 @cache
 def find_basis() -> Basis:
     """The basis of all elements."""
-    x = (np.concatenate([[-1.0], jacobi_nodes(DEGREE - 1, 1, 1), [1.0]]) + 1) / 2
-    y = np.stack([x, x, 1 - x, x, 1 - x])
-    powers = np.arange(DEGREE + 1)
-    to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
-    totals = powers + POWERS[:, None]
-    rises = np.diff(y[..., None] ** totals[:, None], axis=1) / totals[:, None]
-    rises *= 2 * (SIGNS * POWERS)[:, None, None]
-    weights = (1 / (powers + 1)) @ to_powers[0]
-    modes = np.asarray(np.linalg.inv(legendre.legvander(2 * x - 1, DEGREE)), dtype=float)
-    return Basis(y, to_powers, rises @ to_powers, weights, modes)
+    x = np.concatenate([[-1.0], jacobi_nodes(DEGREE - 1, 1, 1), [1.0]])
+    y, power = (x + 1) / 2, np.arange(1, 4)[:, None, None]
+    to_powers = np.asarray(np.linalg.inv(y[:, None] ** POWERS), dtype=float)
+    slopes = POWERS * y[:, None] ** np.maximum(POWERS - 1, 0) @ to_powers
+    rises = np.diff(y[:, None] ** (POWERS + power), axis=1) * 2 * power / (POWERS + power)
+    weights = (1 / (POWERS + 1)) @ to_powers
+    modes = np.asarray(np.linalg.inv(legendre.legvander(x, DEGREE)), dtype=float)
+    return Basis(y, to_powers, slopes, rises @ to_powers, weights, modes)
 
 
 class Grid(NamedTuple):
@@ -64,9 +66,12 @@ class Grid(NamedTuple):
 
     s: Array  # (N + 1,) [m]: element by element, equal where two elements meet
     segment: Numbers  # (N + 1,): of the curve, for each node's forces
-    rests: tuple[bool, bool]  # whether the motion starts and ends at rest
-    held: bool  # whether it does so without acceleration
-    bends: Array  # (E,): c of the elements, zero but for the kind `INSIDE` of `held` motions
+    maps: Array  # (E, 3): s over y in each element, over its length
+
+    @property
+    def held(self) -> bool:
+        """Whether the motion starts and ends without acceleration."""
+        return bool(self.maps[0, 2])
 
     @property
     def steps(self) -> Array:
@@ -85,15 +90,6 @@ class Grid(NamedTuple):
         return self.s.reshape(-1, NODES)[:, [0, -1]]
 
     @property
-    def kinds(self) -> Numbers:
-        """Kind of each element, shape (E,)."""
-        kinds = np.full(len(self.s) // NODES, INSIDE)
-        ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
-        for at in (0, -1):
-            kinds[at] = ends[at] if self.rests[at] else kinds[at]
-        return kinds
-
-    @property
     def sizes(self) -> Array:
         """Scale of b at the nodes over the largest, shape (N + 1,): 1 unless motions are `held`.
 
@@ -102,11 +98,10 @@ class Grid(NamedTuple):
         sizes = np.ones_like(self.s)
         if not self.held:
             return sizes
-        for rest, at, far in ((0, 0, self.s - self.s[0]), (1, -1, self.s[-1] - self.s)):
-            if self.rests[rest]:
-                first = np.diff(self.edges)[at, 0]
-                b = np.where(far < first, first * (far / first) ** (4 / 3), far)
-                sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
+        for at, far in ((0, self.s - self.s[0]), (-1, self.s[-1] - self.s)):
+            first = np.diff(self.edges)[at, 0]
+            b = np.where(far < first, first * (far / first) ** (4 / 3), far)
+            sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
         # The two ends are no unknowns.
         return np.maximum(sizes, np.finfo(float).tiny)
 
@@ -119,25 +114,32 @@ class Grid(NamedTuple):
 
     def integrate(self, a: Array) -> Array:
         """B at the nodes for s'' there, from rest, shape (N + 1,)."""
-        lengths = np.diff(self.edges)
-        table, links = a.reshape(-1, NODES, 1), find_basis().links
-        bent = self.bends[:, None, None] * (links[FROM_REST] - links[INSIDE])
-        rises = lengths * ((links[self.kinds] + bent) @ table)[..., 0]
+        lengths, links = np.diff(self.edges), np.tensordot(self.maps, find_basis().links, 1)
+        rises = lengths * (links @ a.reshape(-1, NODES, 1))[..., 0]
         return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
 
 
 def lay_out(edges: Array, segment: Numbers, rests: tuple[bool, bool], held: bool = False) -> Grid:
-    """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
-    bends = np.zeros(len(edges))
-    grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held, bends)
-    kinds = grid.kinds
-    if held:
-        bends = _find_bends(edges, rests) * (kinds == INSIDE)
-    y, c = find_basis().y[kinds] ** POWERS[kinds, None], bends[:, None]
-    share = np.where(SIGNS[kinds, None] > 0, (1 - c) * y + c * y**2, 1 - y)
-    s = edges[:, :1] + share * np.diff(edges)
+    """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,).
+
+    `rests` is whether the motion starts and ends at rest, with `held` without acceleration.
+    """
+    bends = _find_bends(edges, rests) if held else np.zeros(len(edges))
+    maps, y = list_maps(bends, rests, held), find_basis().y
+    s = edges[:, :1] + np.diff(edges) * (maps @ [y, y**2, y**3])
     s[:, -1] = edges[:, 1]
-    return grid._replace(s=s.ravel(), bends=bends)
+    return Grid(s.ravel(), np.repeat(segment, NODES), maps)
+
+
+def list_maps(bends: Array, rests: tuple[bool, bool] = (True, True), held: bool = False) -> Array:
+    """Maps of elements with such bends amid a motion, shape (E, 3)."""
+    start = FROM_HOLD if held else FROM_REST
+    maps = INSIDE + bends[:, None] * (FROM_REST - INSIDE)
+    if rests[0]:
+        maps[0] = start
+    if rests[1]:
+        maps[-1] = BACKWARDS @ start
+    return maps
 
 
 def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
@@ -174,62 +176,66 @@ def follow(grid: Grid, a: Array, lam: Array) -> Profile:
 
 
 class Elements:
-    """The polynomials of a profile at the nodes of a grid."""
+    """The polynomials of a profile at the nodes of a grid.
+
+    Where a map grows flatter y is measured backwards: so b is exact to rounding next to rest.
+    """
 
     def __init__(self, grid: Grid, profile: Profile) -> None:
-        self.grid, basis, kinds = grid, find_basis(), grid.kinds
-        self._y, self._power = basis.y[kinds].ravel(), POWERS[kinds]
-        table = np.stack([profile.a, profile.lam], axis=-1)
-        self._motion = basis.to_powers[kinds] @ table.reshape(len(kinds), NODES, 2)
-        a, powers = np.diff(grid.edges) * self._motion[..., 0], np.arange(NODES)
-        # b over y^(2 power - 2); without acceleration at rest the first term would be rounding.
-        power = self._power[:, None]
-        rises = 2 * (power * SIGNS[kinds, None]) * a / (powers + power)
-        first, none = profile.b.reshape(-1, NODES)[:, :1], np.zeros((len(kinds), 1))
-        inside, rooted = np.hstack([first, rises]), np.hstack([rises, none])
-        cubic = np.hstack([rises[:, 1:], none, none])
-        self._b = np.where(power == 1, inside, np.where(power == 2, rooted, cubic))
-        if grid.bends.any():
-            c = grid.bends[:, None]
-            self._b = np.hstack([self._b, none])
-            self._b[:, 1:-1] *= 1 - c
-            self._b[:, 2:] += 4 * c * a / (powers + 2)
+        self.grid, basis, back = grid, find_basis(), grid.maps[:, 1] < 0
+        turn = back[:, None]
+        self._maps = np.where(turn, grid.maps @ BACKWARDS.T, grid.maps)
+        self._y = np.where(turn, 1 - basis.y, basis.y).ravel()
+        self._starts = np.where(back, *grid.edges.T[::-1])
+        self._lengths = np.where(back, -1.0, 1.0) * np.diff(grid.edges)[:, 0]
+        table = np.stack([profile.a, profile.lam], axis=-1).reshape(len(back), NODES, 2)
+        self._motion = basis.to_powers @ np.where(turn[..., None], table[:, ::-1], table)
+        # b' = 2 a, from where y is zero: for each power of the map one further power of y.
+        count = 3 if grid.maps[:, 2].any() else 2
+        self._b = np.zeros((len(back), NODES + count))
+        self._b[:, 0] = np.where(back, *profile.b.reshape(-1, NODES)[:, [-1, 0]].T)
+        a = 2 * self._lengths[:, None] * self._motion[..., 0]
+        for power in range(1, count + 1):
+            rises = power * self._maps[:, [power - 1]] * a / (POWERS + power)
+            self._b[:, power : power + NODES] += rises
+
+    def find_share(self, k: Numbers, y: Array) -> Array:
+        """Part of the element before places y of intervals k."""
+        slope, bend, cubic = self._maps[k // NODES].T
+        return np.asarray(y * (slope + y * (bend + y * cubic)))
+
+    def find_s(self, k: Numbers, y: Array) -> Array:
+        """Places y of intervals k on the curves [m]."""
+        element = k // NODES
+        return np.asarray(self._starts[element] + self._lengths[element] * self.find_share(k, y))
+
+    def find_stretch(self, k: Numbers, y: Array) -> Array:
+        """Slope ds/dy at places y of intervals k [m]."""
+        slope, bend, cubic = self._maps[k // NODES].T
+        return np.asarray(self._lengths[k // NODES] * (slope + y * (2 * bend + 3 * y * cubic)))
 
     def find_y(self, k: Numbers, done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
-        power, c = self._power[k // NODES], self.grid.bends[k // NODES]
-        y, later = self._y[k], self._y[k + 1]
-        here = left * y + done * later
-        for one in (2, 3):
-            at = power == one
-            part = left[at] * y[at] ** one + done[at] * later[at] ** one
-            here[at] = np.maximum(part, 0.0) ** (1 / one)
-        at = c != 0
-        y, later, c = y[at], later[at], c[at]
-        part = left[at] * ((1 - c) * y + c * y**2) + done[at] * ((1 - c) * later + c * later**2)
-        root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * part, 0.0))
-        here[at] = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
-        return here
+        before, after = (self.find_share(k, self._y[node]) for node in (k, k + 1))
+        share = np.maximum(left * before + done * after, 0.0)
+        slope, bend, cubic = self._maps[k // NODES].T
+        root = slope + np.sqrt(slope**2 + 4 * bend * share) + cubic
+        y = 2 * share / np.maximum(root, np.finfo(float).tiny)
+        return np.where(cubic > 0, np.cbrt(share), y)
 
-    def find_ramps(self, k: Numbers) -> tuple[Any, Array, Array, Array]:
-        """Which of the intervals k are next to rest, the power of y in s, y there and its rise."""
-        rooted = np.flatnonzero(self._power[k // NODES] > 1)
-        k = k[rooted]
-        return rooted, self._power[k // NODES], self._y[k], self._y[k + 1] - self._y[k]
+    def find_ramps(self, k: Numbers) -> tuple[Flags, Array, Array]:
+        """Which of the intervals k are next to rest, y at their starts, and its rise there."""
+        return self._maps[k // NODES, 0] == 0, self._y[k], self._y[k + 1] - self._y[k]
 
     def evaluate(self, k: Numbers, y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
         element = k // NODES
-        motion = self._motion[element, -1].T
+        motion, b = self._motion[element, -1].T, self._b[element, -1]
         for power in reversed(range(DEGREE)):
             motion = motion * y + self._motion[element, power].T
-        b = self._b[element, -1]
         for power in reversed(range(self._b.shape[1] - 1)):
             b = b * y + self._b[element, power]
         speed = np.sqrt(np.maximum(b, 0.0))
-        for one in (2, 3):
-            at = self._power[element] >= one
-            speed[at] *= y[at]
         return Profile(motion[0], speed**2, motion[1]), speed
 
     def at(self, fractions: Array) -> Profile:
@@ -286,26 +292,29 @@ class PathMotion:
         speed, k = np.sqrt(self.profile.b), self.grid.nonempty
         return speed[k], speed[k + 1]
 
+    def _find_y(self, n: Numbers, w: Array) -> Array:
+        """Local variable y at places w from 0 to 1, shape (m,), of n-th intervals inside elements.
+
+        Amid a motion the speed at constant s'' is linear in w; next to rest y is.
+        """
+        k, (v0, v1) = self.grid.nonempty[n], (speed[n] for speed in self._ends)
+        total = np.maximum(v0 + v1, _TINY)
+        done = w * (v0 * (2 - w) + v1 * w) / total
+        left = (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
+        ramps, first, rise = self.elements.find_ramps(k)
+        return np.where(ramps, first + w * rise, self.elements.find_y(k, done, left))
+
     @cached_property
     def _slowness(self) -> Array:
-        """Slope of time over w and the mean time, at Gauss points of each solid interval, (n, m).
-
-        In the variable w from 0 to 1, amid a motion the speed at constant s'' is linear; next to
-        rest y is.
-        """
-        k, (v0, v1) = self.grid.nonempty, (speed[:, None] for speed in self._ends)
-        w = (1 + _GAUSS) / 2
-        done, left = _share(v0, v1, w)
-        every, plain = np.repeat(k, len(w)), v0 * (1 - w) + v1 * w
-        y = self.elements.find_y(every, done.ravel(), left.ravel()).reshape(done.shape)
-        rooted, *ramps = self.elements.find_ramps(k)
-        power, first, rise = (part[:, None] for part in ramps)
-        mean = self.grid.steps[k[rooted], None] / np.maximum(v0 + v1, _TINY)[rooted]
-        length = np.diff(self.grid.edges)[k[rooted] // NODES]
-        y[rooted] = first + w * rise
-        plain[rooted] = power / 2 * np.abs(rise) * length * y[rooted] ** (power - 1) / mean
-        speed = self.elements.evaluate(every, y.ravel())[1].reshape(done.shape)
-        return np.asarray(plain / np.maximum(speed, np.maximum(plain / _STALLED, _TINY)))
+        """Slope of time over w and mean time, at Gauss points in each solid interval, (n, m)."""
+        count = len(self.grid.nonempty)
+        n, w = np.repeat(np.arange(count), _POINTS), np.tile((1 + _GAUSS) / 2, count)
+        k, y, (v0, v1) = self.grid.nonempty[n], self._find_y(n, w), (v[n] for v in self._ends)
+        ramps, _, rise = self.elements.find_ramps(k)
+        plain = rise * self.elements.find_stretch(k, y) * (v0 + v1) / (2 * self.grid.steps[k])
+        plain = np.where(ramps, plain, v0 * (1 - w) + v1 * w)
+        speed = np.maximum(self.elements.evaluate(k, y)[1], np.maximum(plain / _STALLED, _TINY))
+        return np.asarray((plain / speed).reshape(count, -1))
 
     @property
     def stalls(self) -> bool:
@@ -325,11 +334,10 @@ class PathMotion:
         v0, v1 = (speed[:, None] for speed in self._ends)
         here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
         w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
-        rooted, _, first, rise = self.elements.find_ramps(self.grid.nonempty)
-        k = np.repeat(self.grid.nonempty[rooted], len(fractions))
-        done = np.tile(fractions, len(rooted))
-        y = self.elements.find_y(k, done, 1 - done).reshape(len(rooted), len(fractions))
-        w[rooted] = np.clip((y - first[:, None]) / rise[:, None], 0.0, 1.0)
+        k, done = np.repeat(self.grid.nonempty, len(fractions)), np.tile(fractions, len(w))
+        ramps, first, rise = self.elements.find_ramps(k)
+        linear = np.clip((self.elements.find_y(k, done, 1 - done) - first) / rise, 0.0, 1.0)
+        w = np.where(ramps, linear, w.ravel()).reshape(w.shape)
         powers = legendre.legvander(2 * w - 1, _POINTS)
         return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
 
@@ -356,15 +364,8 @@ class PathMotion:
             late = np.einsum("np,np->n", legendre.legvander(x, _POINTS), clock) - local
             rate = 2 * np.einsum("np,np->n", legendre.legvander(x, _POINTS - 1), slope)
             w = np.clip(w - late / rate, 0.0, 1.0)
-        v0, v1 = (speed[n] for speed in self._ends)
-        done, left = _share(v0, v1, w)
-        y = self.elements.find_y(k, done, left)
-        rooted, power, first, rise = self.elements.find_ramps(k)
-        y[rooted] = first + w[rooted] * rise
-        whole = (first + rise) ** power - first**power
-        done[rooted] = (y[rooted] ** power - first**power) / whole
-        here, _ = self.elements.evaluate(k, y)
-        return self.grid.s[k] + done * self.grid.steps[k], self.grid.segment[k], here
+        y = self._find_y(n, w)
+        return self.elements.find_s(k, y), self.grid.segment[k], self.elements.evaluate(k, y)[0]
 
     @property
     def spans(self) -> list[tuple[float, float, Directions]]:
@@ -387,10 +388,3 @@ class PathMotion:
         acceleration = point.z_s * a[:, None] + point.z_ss * b[:, None]
         motion = point.z, point.z_s * np.sqrt(b)[:, None], acceleration
         return Samples(*motion, forces.tau(a, b, lam), c_n, c_t)
-
-
-def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
-    """Parts of an interval done and left where the speed is v0 + w (v1 - v0) at constant s''."""
-    total = np.maximum(v0 + v1, _TINY)
-    done = w * (v0 * (2 - w) + v1 * w) / total
-    return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total

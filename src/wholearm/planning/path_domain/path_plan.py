@@ -60,20 +60,14 @@ from .path_mesh import (
 )
 from .path_motion import (
     DEGREE,
-    FROM_HOLD,
-    FROM_REST,
-    INSIDE,
     NODES,
-    POWERS,
-    SIGNS,
-    TO_HOLD,
-    TO_REST,
     Elements,
     Grid,
     PathMotion,
     Profile,
     find_basis,
     follow,
+    list_maps,
 )
 
 if TYPE_CHECKING:
@@ -635,38 +629,25 @@ def _find_lengths(h: Expression) -> Expression:
     return ca.sum1(ca.reshape(ca.vertcat(h, 0), NODES, -1))
 
 
-def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expression:
-    """Rise of b from each node to the next, shape (N,); with `bends` under rate limits."""
-    table, lengths = ca.reshape(a, NODES, -1), _find_lengths(h)
-    count = lengths.numel()
-    links, kinds = find_basis().links, list_kinds(count, bends is not None)
-    rises = ca.horzcat(*(ca.DM(links[kind]) @ table[:, k] for k, kind in enumerate(kinds)))
-    if bends is not None:
-        inner = ca.DM(links[FROM_REST] - links[INSIDE]) @ table[:, 1:-1]
-        rises[:, 1:-1] += inner * ca.repmat(bends[1:-1], DEGREE, 1)
-    rises = rises * ca.repmat(lengths, DEGREE, 1)
-    return ca.vec(ca.vertcat(rises, ca.SX(1, count)))[:-1]
+def _write_rises(a: Expression, h: Expression, maps: Expression) -> Expression:
+    """Rise of b from each node to the next, shape (N,), on elements with `maps`, (3, E)."""
+    table, lengths, links = ca.reshape(a, NODES, -1), _find_lengths(h), find_basis().links
+    scales = [ca.repmat(maps[k, :] * lengths, DEGREE, 1) for k in range(3)]
+    rises = sum(scale * (ca.DM(link) @ table) for scale, link in zip(scales, links, strict=True))
+    return ca.vec(ca.vertcat(rises, ca.SX(1, lengths.numel())))[:-1]
 
 
 def _find_paces(
-    a: Expression, speed: Expression, h: Expression, bends: Expression | None
+    a: Expression, speed: Expression, h: Expression, maps: Expression, held: bool
 ) -> Expression:
     """Rate dy/dt of the local variable at each node, times the element's length, (p + 1, E)."""
-    basis, held = find_basis(), bends is not None
-    lengths = _find_lengths(h)
-    count = lengths.numel()
-    paces = ca.reshape(speed, NODES, -1)
-    if bends is not None:
-        c = ca.repmat(bends[1:-1], NODES, 1)
-        paces[:, 1:-1] /= 1 - c + 2 * c * ca.repmat(ca.DM(basis.y[INSIDE]), 1, count - 2)
-    slopes = find_first_slopes(a) if held else (a[0], a[-1])
-    # Next to rest the speed is a power of the local variable times a smooth factor.
-    for e, kind in ((0, list_kinds(count, held)[0]), (count - 1, list_kinds(count, held)[-1])):
-        rest, power = 0 if SIGNS[kind] > 0 else DEGREE, int(POWERS[kind])
-        for j, y in enumerate(basis.y[kind].tolist()):
-            growth = SIGNS[kind] * slopes[0 if e == 0 else 1]
-            start = ca.sqrt((1.5 if held else 2) * lengths[e] * growth)
-            paces[j, e] = (start if j == rest else paces[j, e] / y ** (power - 1)) / power
+    y, lengths = find_basis().y, _find_lengths(h)
+    stretches = ca.DM(np.column_stack([y**0, 2 * y, 3 * y**2])) @ maps
+    paces = ca.reshape(speed, NODES, -1) / stretches
+    # At rest speed and stretch vanish: s'' or its slope makes the speed a power of y there.
+    growths, power = (find_first_slopes(a), 3) if held else ((a[0], -a[-1]), 2)
+    for at, growth in zip((0, -1), growths, strict=True):
+        paces[at, at] = ca.sqrt(power / (power - 1) * lengths[at] * growth) / power
     return paces
 
 
@@ -675,26 +656,10 @@ def _find_bends(values: Expression, degree: int) -> Expression:
     return ca.sum1((ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, NODES, -1)) ** 2)
 
 
-def list_kinds(count: int, held: bool) -> list[int]:
-    """Kinds of `count` elements from rest to rest."""
-    start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
-    return [start, *[INSIDE] * (count - 2), stop]
-
-
 def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
-    """Slopes of s'' over y at the start, and at the end backwards."""
-    basis = find_basis()
-    start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:NODES]
-    return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-NODES:]
-
-
-def list_slopes() -> list[Array]:
-    """Differentiation matrices at the nodes of each kind of element, over y in forward time."""
-    basis, powers = find_basis(), np.arange(NODES)
-    return [
-        sign * (powers * y[:, None] ** np.maximum(powers - 1, 0)) @ to_powers
-        for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True)
-    ]
+    """Slopes of s'' over y at the start and at the end."""
+    slopes = ca.DM(find_basis().slopes)
+    return slopes[0, :] @ a[:NODES], slopes[-1, :] @ a[-NODES:]
 
 
 class Units(NamedTuple):
@@ -759,7 +724,7 @@ class PathNLP:
     node: Columns
     # `steps`, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limits at the nodes, column by column (the constant ones are part of the
-    # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, bends of
+    # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, maps of
     # elements and `sizes` of b for rate limits
     p: Columns
     # b' = 2 a; the `chain` of the margin; node by node the `limits`, side by side where they are
@@ -789,18 +754,20 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         sizes |= {"joints": 2}
     if slow:
         sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
-        sizes |= {"bends": n // NODES, "sizes": n}
+        sizes |= {"maps": 3 * n // NODES, "sizes": n}
     p = Columns(**sizes)
     symbols = p.make_symbols()
     b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
     extra = ca.SX.sym("extra", n, m if soft else int(late))
     h, fast = symbols.steps, list(shape.fast)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
-    bends, scales = (symbols.bends.T, symbols.sizes) if slow else (None, ca.DM.ones(n))
+    maps, scales = ca.DM(list_maps(np.zeros(n // NODES)).T), ca.DM.ones(n)
+    if slow:
+        maps, scales = ca.reshape(symbols.maps, -1, 3).T, symbols.sizes
     b = ca.vertcat(0, b_inner * scales[1:-1], 0)
     speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
     largest = ca.fmax(scales[1:], scales[:-1])
-    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
+    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, maps, bool(slow))
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
 
     def scale(name: str, column: Expression) -> Expression:
@@ -841,17 +808,16 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         limits = ca.horzcat(*sides)
     none = ca.SX(0, 1)
     rows = {
-        "links": (b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
+        "links": (b[1:] - b[:-1] - _write_rises(a, h, maps)) / largest,
         "chain": extra[1:] - extra[:-1] if late else none,
         "limits": ca.vec(limits.T),
         "duration": ca.sum1(times) if late else none,
     }
-    rates, kinds = dict[int, Expression](), list_kinds(n // NODES, True)
+    rates, slopes = dict[int, Expression](), ca.DM(find_basis().slopes)
     for joint in slow:
         # The derivative of the polynomials of y through the torques at the nodes.
-        table = ca.reshape(torques[:, joint], NODES, -1)
-        parts = [ca.DM(list_slopes()[kind]) @ table[:, e] for e, kind in enumerate(kinds)]
-        rates[joint] = ca.vec(ca.horzcat(*parts) * paces / ca.repmat(lengths, NODES, 1))
+        table = slopes @ ca.reshape(torques[:, joint], NODES, -1)
+        rates[joint] = ca.vec(table * paces / ca.repmat(lengths, NODES, 1))
     quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
     lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(shape.commands)]
     joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
@@ -902,7 +868,7 @@ def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) 
         scene, rates, commands = data.curve.formation.scene, list(shape.rates), list(shape.commands)
         blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
         blocks["lags"] = scene.actuator_lag[commands] / units.time
-        blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
+        blocks |= {"maps": data.grid.maps, "sizes": data.grid.sizes}
     return np.asarray(
         nlp.p.join(
             steps=data.grid.steps / units.length,
@@ -959,10 +925,9 @@ def make_bounds(
     rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
     torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
     quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
     within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
-    motors_low = -within, joins, begins, -np.inf * begins
-    motors_high = within, joins, np.inf * begins, -begins
+    motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
