@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
@@ -258,43 +257,32 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
         raise SolverError("the motion all but stops between two nodes; plan with more intervals")
     breaks = np.append(motion.times[k], motion.times[-1])
     values = data.knots.forces.tau(*data.interpolate(motion.profile, knots))
-    torque = _fit(breaks, 2 * spans / spans[:, -1:] - 1, values)
+    torque = _fit(breaks, spans, values)
     times = motion.times[k, None] + motion.durations(checks)
     wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
     inner = np.tile((checks > 0) & (checks < 1), len(k))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        x = -np.cos(np.pi * (np.arange(PLACES) + 0.5) / PLACES)
-        places = breaks[:-1, None] + np.diff(breaks)[:, None] * (1 + x) / 2
-        torque = _fit(breaks, x[None], motion.evaluate(places.ravel()).tau)
+        torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
     return torque, torque.integrate_squares()
-
-
-def _fit(breaks: Array, x: Array, tau: Array) -> TorqueProfile:
-    """Polynomials through torques at places x in [-1, 1] of every interval, (n or 1, m)."""
-    vandermonde = x[..., None] ** np.arange(x.shape[1])
-    coefficients = np.linalg.solve(vandermonde, tau.reshape(len(breaks) - 1, -1, 2))
-    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
 
 
 def find_torques(
     data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
 ) -> tuple[Array, Array]:
-    """Torques and their rates, (n_solid, LOOKS, 2) [N m, N m/s], at evenly spaced times.
-
-    By Chebyshev interpolation in time through torques within each interval.
-    """
+    """Torques and their rates, (n_solid, 2, LOOKS) [N m, N m/s], at evenly spaced times."""
     checks, count = data.sampling.checks, len(data.grid.nonempty)
     picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
     places, fractions = data.checks.pick(np.tile(picked, count)), checks[picked]
-    values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
     spans = np.concatenate([motion.durations(fractions) for motion in motions])
-    degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)
-    through = chebyshev.chebvander(2 * spans / lasts[:, None] - 1, degree)
-    # Where two places fall on one instant no polynomial goes through both.
-    modes = np.linalg.solve(through + 1e-300, values)
+    values = places.forces.tau(*data.interpolate(profile, fractions))
+    torque = _fit(np.append(0.0, np.cumsum(spans[:, -1])), spans, values)
     looks = np.linspace(-1, 1, LOOKS)
-    slopes = chebyshev.chebder(np.eye(degree + 1), axis=0)
-    torques = chebyshev.chebvander(looks, degree) @ modes
-    rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
-    return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])
+    return torque.at_places(looks), torque.slopes.at_places(looks)
+
+
+def _fit(breaks: Array, spans: Array, tau: Array) -> TorqueProfile:
+    """Polynomials in time through torques at `spans` since the breaks, (n, m) [s]."""
+    x = 2 * spans / spans[:, -1:] - 1
+    coefficients = np.linalg.solve(x[..., None] ** np.arange(x.shape[1]), tau.reshape(*x.shape, 2))
+    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))

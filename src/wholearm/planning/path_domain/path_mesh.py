@@ -163,8 +163,9 @@ def equidistribute(part: PhaseData, motion: PathMotion, costs: Array, elements: 
     cube root of the `costs` of keeping limits between nodes, shape (N + 1,).
     """
     rates = find_torques(part, motion.profile, [motion])[1]
-    most = np.maximum(np.abs(rates).max(axis=(0, 1)), part.torque_limit / motion.duration)
-    changes = np.abs(np.diff((rates / most).reshape(-1, 2), axis=0, prepend=0.0)).sum(axis=1)
+    rates = rates.transpose(0, 2, 1).reshape(-1, 2)
+    most = np.maximum(np.abs(rates).max(axis=0), part.torque_limit / motion.duration)
+    changes = np.abs(np.diff(rates / most, axis=0, prepend=0.0)).sum(axis=1)
     variation = changes.reshape(len(part.grid.edges), -1).sum(axis=1)
     ends = motion.times.reshape(-1, NODES)
     spans = ends[:, -1] - ends[:, 0]

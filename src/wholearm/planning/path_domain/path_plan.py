@@ -433,9 +433,7 @@ class PathIterate:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
         # What tightening by the violations will cost, and what it has.
-        (short, speeding), hurry, _ = self.misses
-        due = self._price(*map(self.data.spread_to_nodes, (short, speeding, hurry)))
-        costs = due + self.paid
+        costs = self.paid + self._price(*map(self.data.spread_to_nodes, self.misses[:2]))
         shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
         costly = _GAP * float(costs.sum()) > accuracy
         if task.is_held and (self.meshes < 2 or (costly and self.meshes < 4)):
@@ -468,7 +466,7 @@ class PathIterate:
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
         data, tight = self.data, self.tightening
-        (short, speeding), hurry, _ = self.misses
+        short, over, _ = self.misses
         solution, duration = self.solution, self.task.duration
         if duration is not None:
             # The quadrature of the NLP is not that of the motion.
@@ -479,15 +477,9 @@ class PathIterate:
         slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
         least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
         reach = np.where(short > 0, least, 0.0)
-        over = 1.05  # tightening over the violation
-        added = over * data.spread_to_nodes(short)
-        tighter = Tightening(
-            np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
-            tight.speed_share * (1 - over * data.spread_to_nodes(speeding)),
-            duration,
-            tight.missed + added,
-            tight.motors * (1 - over * data.spread_to_nodes(hurry)),
-        )
+        added, less = (1.05 * data.spread_to_nodes(violation) for violation in (short, over))
+        limits = np.maximum(tight.limits, data.spread_to_nodes(reach)) + added
+        tighter = Tightening(limits, tight.missed + added, tight.shares * (1 - less), duration)
         return replace(self, tightening=tighter)
 
     @cached_property
@@ -504,30 +496,30 @@ class PathIterate:
         return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property
-    def misses(self) -> tuple[tuple[Array, Array], Array, float]:
-        """Violations between nodes: of limits and b, of torque rates, of the duration."""
+    def misses(self) -> tuple[Array, Array, float]:
+        """Violations between nodes: of limits, of what `Tightening.shares` has, of the duration."""
         duration, late = self.task.duration, 0.0
         if duration:
             late = sum(motion.duration for motion in self.motions) / duration - 1
         data, profile = self.data, self.solution.profile
-        hurry = np.zeros((len(data.grid.nonempty), 2, 2))
+        over = np.zeros((len(data.grid.nonempty), 5))
+        short, over[:, 0] = data.misses(profile, self.solution.margin)
         if data.grid.held:
-            # Relative violations of rates and commands of each joint in each interval.
             torques, rates = find_torques(data, profile, self.motions)
-            rate = np.abs(rates).max(axis=1) / data.rate_limit
+            rate = np.abs(rates).max(axis=2) / data.rate_limit
             lags = data.curve.formation.scene.actuator_lag
-            command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
-            hurry = np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0)
-        return data.misses(profile, self.solution.margin), hurry, late
+            command = np.abs(torques + lags[:, None] * rates).max(axis=2) / data.torque_limit
+            over[:, 1:] = np.maximum(np.hstack([rate, command * (lags > 0)]) - 1, 0.0)
+        return short, over, late
 
     @property
     def violation(self) -> float:
         """The largest violation between nodes, over the allowed one."""
         if any(motion.stalls for motion in self.motions):
             return np.inf
-        (short, speeding), hurry, late = self.misses
-        over = (short / self.data.spans).max(), speeding.max(), late
-        return float(max(max(over) / MISS, hurry.max() / 1e-4))  # rates relatively
+        short, over, late = self.misses
+        most = max((short / self.data.spans).max(), over[:, 0].max(), late)
+        return float(max(most / MISS, over[:, 1:].max() / 1e-4))
 
     @property
     def error(self) -> float:
@@ -541,14 +533,13 @@ class PathIterate:
     @cached_property
     def paid(self) -> Array:
         """Relative cost at each node of the tightening so far."""
-        tight = self.tightening
-        return self._price(tight.missed, 1 - tight.speed_share, 1 - tight.motors)
+        return self._price(self.tightening.missed, 1 - self.tightening.shares)
 
-    def _price(self, limits: Array, speed_share: Array, motors: Array) -> Array:
+    def _price(self, limits: Array, shares: Array) -> Array:
         """First-order relative cost of tightening at each node, shape (n,).
 
-        The sum of multipliers times the tightening of limits, (n, n_sides), b, (n,), and torque
-        rates and commands, (n, 2, 2).
+        The sum of multipliers times the tightening of limits, (n, n_sides), and what is taken from
+        `Tightening.shares`, (n, 5).
         """
         nlp, data, units, solution = self.nlp, self.data, self.units, self.solution
         rows, signs, _ = data.limits.sides
@@ -557,12 +548,16 @@ class PathIterate:
         on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
         on_b = np.zeros(nlp.free.shape)
         on_b[nlp.free] = solution.multipliers["lam_x0"]
-        on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
-        costs = (on_sides * limits).sum(axis=1) + on_b / units.profile[0] * speed_share
-        motor_rows = (("rates", nlp.shape.rates), ("commands", nlp.shape.commands))
-        for kind, (name, joints) in enumerate(motor_rows):
+        on_shares = np.zeros((count, 5))
+        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
+        on_shares[:, 0] /= units.profile[0]
+        for first, name, joints in (
+            (1, "rates", nlp.shape.rates),
+            (3, "commands", nlp.shape.commands),
+        ):
             on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
-            costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
+            on_shares[:, [first + joint for joint in joints]] = on_rows
+        costs = (on_sides * limits).sum(axis=1) + (on_shares * shares).sum(axis=1)
         scale = abs(solution.cost)
         if self.task.options.goal is Objective.MARGIN:
             scale = abs(self.task.epsilon + solution.margin) / units.force
@@ -696,17 +691,17 @@ class Tightening(NamedTuple):
     """Tightening of limits at the nodes so that they hold between nodes too."""
 
     limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
-    speed_share: Array  # (N + 1,): factor on the largest b
-    duration: float | None  # [s]: longest duration, if there is one
     missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
-    motors: Array  # (N + 1, 2, 2): factors on torque rate limits and on the largest commands
+    # (N + 1, 5): factors on the largest b, both torque rate limits and both largest commands
+    shares: Array
+    duration: float | None  # [s]: longest duration, if there is one
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
         count = len(data.grid.s)
         limits = np.zeros((count, len(data.spans)))
-        return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
+        return Tightening(limits, limits, np.ones((count, 5)), duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -888,14 +883,14 @@ def make_bounds(
     pins: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
-    tight, speed_share, duration, *_ = tightening
+    share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
     n, node = len(data.grid.s), nlp.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes)
     # Next to rest b is 2 s times the least s''.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-    high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
     if data.grid.held:
         low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
     # From rest to rest, without reversal.
@@ -912,7 +907,7 @@ def make_bounds(
             low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
-    sides = bounds + signs * tight - data.find_terms()[:, rows, ONE]
+    sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
     sides /= units.of(data.limits)[rows]
     side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
     width = nlp.g.sizes["limits"] // n
@@ -921,10 +916,10 @@ def make_bounds(
     rows_high[:, side[signs < 0]] = sides[:, signs < 0]
     late = nlp.g.sizes["duration"]
     equal = np.zeros(nlp.g["limits"].start)
-    longest = np.full(late, (duration or np.inf) / units.time)
+    longest = np.full(late, (tightening.duration or np.inf) / units.time)
     rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
     torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
-    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
+    most = most * data.torque_limit / torque
     joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
     within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
     motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
