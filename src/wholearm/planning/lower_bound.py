@@ -175,13 +175,7 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     """
     path = PathTerms(curves, epsilon)
     grid = path.make_grid(intervals)
-    ends, angles = path.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
-    limits, cap = path.evaluate(angles[:, None], grid.owners).pick((slice(None), 0)), None
-    if np.isfinite(limits.cap).any():
-        sides = np.column_stack([grid.angles[:-1], grid.angles[1:]])
-        cap = join_caps(*path.evaluate(sides, grid.owners).cap.T)
-    steps = np.diff(ends)
-    motion = speed_sweep(limits, steps, (path.place(angles) - ends[:-1]) / steps, cap)
+    *_, motion, duration = _bound(path, grid, None)
     # Where segments meet, on both sides.
     lasts = np.flatnonzero(np.diff(grid.owners))
     turns, both = np.repeat(lasts + 1, 2), np.stack([lasts, lasts + 1], axis=1).ravel()
@@ -190,7 +184,7 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     least, most = find_range(at_turns.rows[..., A], slack + _SHORT)
     if (slow := (least > most).all(axis=0)).any():
         raise NoMotionError(int(turns[slow.argmax()]))
-    return float(find_duration(motion.b, steps))
+    return duration
 
 
 def _bound(
