@@ -958,7 +958,9 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
     return follow(grid, a, lam), margin
 
 
-_SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
+# Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one
+# that is tried; case: joints with strong drag.
+_SLOW, _LEAST = -12, -32
 _BELOW = 0.9  # squared speed of a guess over that of the minimum-time profile: strictly feasible
 # Complementarity of multipliers near the central path, and least slack, in units of the NLP.
 _CENTRAL, _SLACK = 1e-4, 1e-3
@@ -977,15 +979,14 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
         low, high = limits.find_internal_force_range(a, b)
         return bool(((low <= high) & (low < np.inf) & (b <= limits.cap)).all())
 
-    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
-    low_power, high_power = float(_SLOW), 8.0
-    for _ in range(7):
+    low_power, high_power = float(_LEAST), 8.0
+    for _ in range(8):
         power = (low_power + high_power) / 2
         if possible(fall * 2**power):
             low_power = power
         else:
             high_power = power
-    none = low_power == _SLOW
+    none = low_power == _LEAST
     return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
 
 
@@ -995,20 +996,8 @@ def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
 
 
 def _fall(data: PhaseData) -> float:
-    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
-    length, forces = float(data.grid.s[-1]), data.nodes.forces
-    fall = 2 * data.curve.formation.scene.scales.acceleration * length
-
-    def usual(coefficients: Array) -> float:
-        """Value at which this coefficient alone takes a joint to its torque limit."""
-        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
-
-    # The upper median; NumPy's takes 10 ms to import what it needs.
-    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
-    median = float(np.partition(b_max, middle)[middle])
-    inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
-    # Above what torques alone allow; case: joints with strong drag.
-    return min(fall, 30.0 * min(inertia, drag, median))
+    """The b of a fall over the length of the curve [m^2/s^2]."""
+    return float(2 * data.curve.formation.scene.scales.acceleration * data.grid.s[-1])
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
