@@ -717,10 +717,10 @@ class PathNLP:
     # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
     # shortfalls for `elastic`, or the least margin
     node: Columns
-    # `steps`, `weight` of time, unit of internal force in the regularization;
-    # coefficients of the limits at the nodes, column by column (the constant ones are part of the
-    # bounds); constant torques and weights of joints for `effort`; 1 / rate limits, lags, maps of
-    # elements and `sizes` of b for rate limits
+    # `steps`, `weight` of time, unit of internal force in the regularization; constant torques and
+    # weights of joints for `effort`; coefficients of the limits at the nodes, column by column (the
+    # constant ones are part of the bounds); for rate limits 1 / these, lags, maps of elements and
+    # `sizes` of b
     p: Columns
     # b' = 2 a; the `chain` of the margin; node by node the `limits`, side by side where they are
     # soft; the `duration` for `margin`; rate limits
@@ -741,16 +741,10 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     n, m, slow = intervals + 1, shape.rows, shape.slow
     effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
     soft = objective is Objective.ELASTIC
-    sizes = {"steps": intervals, "weight": 1, "calm": 1}
+    sizes = {"steps": intervals, "weight": 1, "calm": 1, "torque": n * 2, "joints": 2}
     sizes |= {"a": n * m, "b": n * m, "lam": n * m, "speed": n * len(shape.fast)}
-    if effort or slow:
-        sizes |= {"torque": n * 2}
-    if effort:
-        sizes |= {"joints": 2}
-    if slow:
-        sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
-        sizes |= {"maps": 3 * n // NODES, "sizes": n}
-    p = Columns(**sizes)
+    sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
+    p = Columns(**sizes, maps=3 * n // NODES, sizes=n)
     symbols = p.make_symbols()
     b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
     extra = ca.SX.sym("extra", n, m if soft else int(late))
@@ -772,9 +766,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     # Limits but for their constant part, which is in the bounds.
     values = scale("a", a) + scale("b", b) + scale("lam", lam)
     values[:, fast] += scale("speed", speed)
-    torques = values[:, list(shape.torques)]
-    if effort or slow:
-        torques += ca.reshape(symbols.torque, n, 2)
+    torques = values[:, list(shape.torques)] + ca.reshape(symbols.torque, n, 2)
     scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
     node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
     rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
@@ -848,30 +840,23 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
 def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) -> Array:
     """Parameters of the NLP, in its units."""
     terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
+    torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
     blocks = {
+        "steps": data.grid.steps / units.length,
+        "weight": np.array([time_weight / units.power]),
+        "calm": np.array([force / units.press]),
         "a": terms[..., A] * a_unit / unit,
         "b": terms[..., B] * b_unit / unit,
         "lam": terms[..., LAMBDA] * force / unit,
-        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
+        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
+        "torque": data.nodes.forces.of_tau[..., ONE] / torque,
+        "joints": torque**2 / units.power,
+        "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
+        "lags": scene.actuator_lag[list(shape.commands)] / units.time,
+        "maps": data.grid.maps,
+        "sizes": data.grid.sizes,
     }
-    torque, shape = unit[list(nlp.shape.torques)], nlp.shape
-    if nlp.objective is Objective.EFFORT or shape.slow:
-        blocks["torque"] = data.nodes.forces.of_tau[..., ONE] / torque
-    if nlp.objective is Objective.EFFORT:
-        blocks["joints"] = torque**2 / units.power
-    if shape.slow:
-        scene, rates, commands = data.curve.formation.scene, list(shape.rates), list(shape.commands)
-        blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
-        blocks["lags"] = scene.actuator_lag[commands] / units.time
-        blocks |= {"maps": data.grid.maps, "sizes": data.grid.sizes}
-    return np.asarray(
-        nlp.p.join(
-            steps=data.grid.steps / units.length,
-            weight=[time_weight / units.power],
-            calm=[force / units.press],
-            **{name: block.ravel("F") for name, block in blocks.items()},
-        )
-    )
+    return np.asarray(nlp.p.join(**{name: block.ravel("F") for name, block in blocks.items()}))
 
 
 def make_bounds(
