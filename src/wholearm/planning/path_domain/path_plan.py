@@ -29,6 +29,7 @@ central path.
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -959,20 +960,14 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     """
     limits, fall = data.find_limits(data.nodes), _fall(data)
 
-    def possible(height: float) -> bool:
-        a, b = _parabola(data, height)
+    def is_blocked(share: float) -> bool:
+        a, b = _parabola(data, fall * share)
         low, high = limits.find_internal_force_range(a, b)
-        return bool(((low <= high) & (low < np.inf) & (b <= limits.cap)).all())
+        return not ((low <= high) & (low < np.inf) & (b <= limits.cap)).all()
 
-    low_power, high_power = float(_LEAST), 8.0
-    for _ in range(8):
-        power = (low_power + high_power) / 2
-        if possible(fall * 2**power):
-            low_power = power
-        else:
-            high_power = power
-    none = low_power == _LEAST
-    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
+    shares = 2 ** np.linspace(_LEAST, 8.0, 256, endpoint=False)
+    kept = bisect_left(shares, True, key=is_blocked)
+    return _guess_at(data, 0.7 * fall * (shares[kept - 1] if kept else 1.0), time_weight)
 
 
 def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
