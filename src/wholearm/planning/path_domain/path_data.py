@@ -81,11 +81,10 @@ class PhaseData(NamedTuple):
         """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
         return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
 
-    def find_limits(self, places: Places, margin: float = 0.0) -> PathLimits:
-        """The limits for a margin of normal forces over epsilon [N]."""
+    def find_limits(self, places: Places) -> PathLimits:
+        """The limits at places, with the internal force."""
         rows = find_slack_rows(self.limits, places.forces, places.rates)
-        normal = np.isin(self.limits.sides[0], self.limits.of(PRESS))
-        return PathLimits(rows, self.largest_b(places)).relax(-margin * normal / self.spans)
+        return PathLimits(rows, self.largest_b(places))
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
