@@ -186,6 +186,7 @@ class Elements:
         turn = back[:, None]
         self._maps = np.where(turn, grid.maps @ BACKWARDS.T, grid.maps)
         self._y = np.where(turn, 1 - basis.y, basis.y).ravel()
+        self._shares = self.find_share(np.arange(len(grid.s)), self._y)
         self._starts = np.where(back, *grid.edges.T[::-1])
         self._lengths = np.where(back, -1.0, 1.0) * np.diff(grid.edges)[:, 0]
         table = np.stack([profile.a, profile.lam], axis=-1).reshape(len(back), NODES, 2)
@@ -216,12 +217,11 @@ class Elements:
 
     def find_y(self, k: Numbers, done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
-        before, after = (self.find_share(k, self._y[node]) for node in (k, k + 1))
-        share = np.maximum(left * before + done * after, 0.0)
+        share = np.maximum(left * self._shares[k] + done * self._shares[k + 1], 0.0)
         slope, bend, cubic = self._maps[k // NODES].T
         root = slope + np.sqrt(slope**2 + 4 * bend * share) + cubic
         y = 2 * share / np.maximum(root, np.finfo(float).tiny)
-        return np.where(cubic > 0, np.cbrt(share), y)
+        return np.where(cubic > 0, np.cbrt(share), y) if cubic.any() else y
 
     def find_ramps(self, k: Numbers) -> tuple[Flags, Array, Array]:
         """Which of the intervals k are next to rest, y at their starts, and its rise there."""
