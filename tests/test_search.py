@@ -33,6 +33,7 @@ from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import CostToGo, trace_phase
 from wholearm.mapping import formation_list
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
+from wholearm.mechanics.statics import Statics
 from wholearm.planning.lower_bound import bound_least_time
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.planning.time_domain.time_motion import TimeMotion
@@ -95,10 +96,20 @@ def test_no_route_along_borders_is_faster() -> None:
     assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
 
 
-def test_a_place_along_a_border_is_a_goal() -> None:
-    route = next(search(Goal(flush=0, x=0.03)).run())
-    (edge,) = route.edges
-    assert abs(edge.stop.z[0] - 0.03) < 1e-9 and edge.steps[0].until.value == 0.03
+def test_under_rate_limits_motions_begin_on_borders_where_torques_hold() -> None:
+    """As the linear programmes of statics say, in the direction of the border."""
+    problem = problem_of(FOLDER / "triangle.toml").with_(friction=0.2, torque_rate_limit=500.0)
+    roadmap, start = Roadmap(problem, 0.1), make_place(problem.scene, problem.start)
+    borders = [chain.borders[0] for chain in roadmap.follow(start)]
+    borders += [chain.borders[0] for each in borders for chain in roadmap.follow(each.stop)]
+    assert any("verge" in border.limits.begins for border in borders)
+    for border in borders:
+        static = Statics(border.formation, border.curve.start)
+        (heading,) = border.curve.interpolate(np.zeros(1))[1]
+        rates = np.append(static.A_t @ heading, heading[3:])
+        modes = static.list_continuous(problem.epsilon) or []
+        begins = any(signs @ rates > 0.9 * np.abs(rates).sum() for _, signs in modes)
+        assert begins == (not border.limits.begins)
 
 
 def test_a_problem_with_a_goal_is_planned() -> None:
@@ -112,6 +123,7 @@ def test_a_problem_with_a_goal_is_planned() -> None:
     phases = tomllib.loads(answer.to_text())["phases"]
     again = build_problem(table_of() | {"phases": phases})
     assert again.phases[0].until == answer.problem.phases[0].until
+    assert again.phases[0].until.value == 0.03
 
 
 def test_charts_are_kept_in_files(tmp_path: Path) -> None:

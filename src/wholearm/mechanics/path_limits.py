@@ -133,6 +133,11 @@ class PathLimits(NamedTuple):
         least, most = find_range(sign * self.rows[..., A], self.rows[..., ONE])
         return np.asarray((np.maximum(least, 0.0) <= most) & (least < np.inf))
 
+    @property
+    def holds(self) -> Flags:
+        """Whether rows without lambda allow rest without acceleration, on the verge, (...,)."""
+        return np.asarray((self.rows[..., ONE] >= 0).all(axis=-1))
+
     def find_largest_b(self) -> Array:
         """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
         rows = self.eliminate(A).rows

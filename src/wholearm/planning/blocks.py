@@ -247,14 +247,20 @@ def _plan_over_time(
 
     problem, failure = planning.problem, None
     slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
+    # Coarse plans of the edges of routes are of free torques, others of those of the block.
+    coarse, begun = over_time.get("only_begin", False), over_time.pop("begun", ())
+    of_free, of_block = (begun, ()) if slow and coarse else ((), begun)
     for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-        free = plan_free(planning, block, z, replace(options, mode_search=complete), **over_time)
+        free_options = replace(options, mode_search=complete)
+        free = plan_free(planning, block, z, free_options, begun=of_free, **over_time)
         plan: Callable[[float | None], Plans] = partial(
-            plan_with_impacts, problem, block, z, options, free=free, **over_time
+            plan_with_impacts, problem, block, z, options, free=free, begun=of_block, **over_time
         )
         with charge(block[0].number):
             try:
-                return plan_with_pauses(planning, block, plan, allowed) if slow else plan(allowed)
+                if slow and not coarse:
+                    return plan_with_pauses(planning, block, plan, allowed)
+                return plan(allowed)
             except (InfeasibleError, SolverError) as error:
                 failure = failure or error
     from .explain import explain_motors
@@ -304,7 +310,7 @@ def plan_free(
     freed = problem is not planning.problem
     if not (freed or runs_along_curves(phases, free_options)):
         return []
-    over_time |= {"fastest": (), "begun": ()}
+    over_time |= {"fastest": ()}
     if not planning.problem.scene.control_period:
         # What holding costs is the difference to an accurate plan.
         over_time["only_begin"], free_options = True, free_options.roughen()
@@ -408,8 +414,8 @@ def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanO
     if scene.control_period:
         options = replace(options, transcription="auto")
     if scene.has_slow_motors or scene.control_period:
-        keys = ("torque_rate_limit", "actuator_lag", "control_period")
-        problem = problem.with_(dict.fromkeys(keys))
+        free = replace(scene.quicken(math.inf), control_period=0.0)
+        problem = replace(problem, scene=free)
     return problem, options
 
 

@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import count, pairwise, takewhile
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
@@ -276,6 +276,11 @@ class RoutePlanner:
     _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
 
+    @cached_property
+    def free(self) -> Problem:
+        """The problem with free torques, with which edges are planned alone."""
+        return free_torques(self.problem, self.options)[0]
+
     @property
     def roadmap(self) -> Roadmap:
         """The roadmap of the search, which keeps plans."""
@@ -337,15 +342,15 @@ class RoutePlanner:
         """The plan of the phases that are printed for a route.
 
         Their ends are those of plans of the route's edges. These are the initial guess, too, if
-        they have the torques and the objective of the plan; for another objective if there is no
+        they have the objective of the plan and its torques are not held; otherwise if there is no
         plan without (query 19, margin).
         """
         problem, options, scene = self.problem, self.options, self.problem.scene
-        # Plans of edges are of least time, with torques that are free to jump.
-        slow = scene.has_slow_motors or scene.control_period > 0
-        alike = options.goal is Objective.TIME and not slow
+        # Parts are planned for least time, and not with held torques.
+        alike = options.goal is Objective.TIME and not scene.control_period
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
+        if scene.control_period:
             problem, options = free_torques(problem, options)
         planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
         if isinstance(planned, Lost):
@@ -354,7 +359,7 @@ class RoutePlanner:
         before = self.before.problem.phases if self.before else ()
         plan: Plan | str = ""
         # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
-        for guesses in (True, False) if alike else (False,) if slow else (False, True):
+        for guesses in (alike, not alike):
             phases = (*before, *list_printed(scene, found, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
@@ -398,8 +403,7 @@ class RoutePlanner:
         def plan_one(part: RoutePart) -> PartPlan | Lost | None:
             """Plan a part; None if another one has no plan."""
             begin = replace(problem, start=part[0][0].start.z)
-            # Coarse plans of other motors are no guesses.
-            made = None if lost else plan_part(begin, part, options, tell, problem is self.problem)
+            made = None if lost else plan_part(begin, part, options, tell)
             if isinstance(made, Lost):
                 lost.append(made)
             return made
@@ -466,7 +470,7 @@ class RoutePlanner:
         self._measurements += len(new)
         if new:
             report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
-        plan = partial(plan_coarsely, self.problem, options=self.options, further=True)
+        plan = partial(plan_coarsely, self.free, options=self.options, further=True)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
         for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
@@ -511,7 +515,7 @@ class RoutePlanner:
             step = first._replace(until=point_out(first.contacts, z))
         # In motion the first guess has no plan in goal 48 of the corpus.
         return plan_coarsely(
-            self.problem,
+            self.free,
             edge,
             (step, *rest),
             self.options,

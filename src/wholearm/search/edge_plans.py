@@ -206,15 +206,12 @@ def split_route(edges: Sequence[Edge]) -> list[list[Edge]]:
 
 @exclusive
 def plan_part(
-    problem: Problem,
-    edges: RoutePart,
-    options: PlanOptions,
-    report: Callable[[str], None],
-    guessed: bool = True,
+    problem: Problem, edges: RoutePart, options: PlanOptions, report: Callable[[str], None]
 ) -> PartPlan | Lost:
     """Plan edges one after the other from the problem's start, on few intervals; or why not.
 
-    Coarse plans of edges through cells are the initial guesses if `guessed`.
+    Coarse plans of edges through cells are the initial guesses. Under rate limits torques have to
+    hold the object at all ends: case query 26, whose plans with free torques end where none do.
     """
     owners, borders = list[int](), dict[int, Edge]()  # the latter by their phase
     steps = [step for edge, coarse in edges for step in (coarse or edge).steps]
@@ -234,7 +231,8 @@ def plan_part(
                 if block[0].index in borders:
                     # From where the edge before lands: goal 18 of the corpus.
                     block = (_aim(block[0], start, borders[block[0].index]),)
-                if runs_along_curves(block, options):
+                along = runs_along_curves(block, options)
+                if along and not problem.scene.has_slow_motors:
                     chain = trace_block(planning, block, start)
                     chain.estimate(problem.epsilon)  # An error where no motion keeps the limits.
                     phases += [(phase, None) for phase in block]
@@ -242,11 +240,11 @@ def plan_part(
                     planning = replace(planning, blocks=(*planning.blocks, made))
                     continue
                 known, guess = None, guesses.get(block[-1].index)
-                if guess and guessed:
+                if guess:
                     known = BlockPlan(block, start, list(guess), None, coarse=True)
                 planning = plan_next(planning, known, report, coarse=True)
                 for phase, plan in zip(block, planning.blocks[-1].plans, strict=True):
-                    motion = cast(TimeMotion, plan.motion)
+                    motion = None if along else cast(TimeMotion, plan.motion)
                     phases.append((pin_landing(phase, end_of(plan)[0]), motion))
     except (WholearmError, np.linalg.LinAlgError) as error:
         failed = owners[len(phases)]

@@ -79,13 +79,15 @@ def find_border_limits(
         z, none = np.zeros((len(steps), 5)), np.zeros(len(steps))
         limits = PathLimits(np.zeros((len(steps), 1, 4)), none)
         return BorderLimits(DEPENDENT, 0.0, "", "", z, limits, steps, none)
-    begins, ends = (
-        "" if limits.pick(k).can_rest(sign) else f"no motion {what} at rest at {place}"
-        for k, sign, what, place in (
-            (0, 1.0, "begins", describe_pose(at.z[0])),
-            (1, -1.0, "ends", describe_pose(at.z[1])),
-        )
-    )
+    reasons = list[str]()
+    for k, sign, what in ((0, 1.0, "begins"), (1, -1.0, "ends")):
+        here, reason = limits.pick(k), ""
+        if not here.can_rest(sign):
+            reason = f"no motion {what} at rest at {describe_pose(at.z[k])}"
+        elif curve.formation.scene.has_slow_motors and not here.holds:
+            reason = f"no torques hold the object on the verge of it at {describe_pose(at.z[k])}"
+        reasons.append(reason)
+    begins, ends = reasons
     inner = slice(2, count)
     part = (middles - nodes[:-1]) / steps
     return BorderLimits(closed, clear, begins, ends, at.z[inner], limits.pick(inner), steps, part)

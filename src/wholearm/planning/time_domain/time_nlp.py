@@ -555,6 +555,10 @@ def hold_ends(
             ends.append((stage, stage.formation, z[0], layout.begin, tau[0, 0]))
         if len(layout.finish):
             ends.append((stage, stage.ending, z[1], layout.finish, tau[-1, -1]))
+            # Case: phase 11 of query 15, whose end no torques hold otherwise.
+            columns = {"z": z[1], "a": layout.a[-1, -1]}
+            brake = brake_kernel(stage.formation)
+            rows.add_copies(brake, columns, stage.directions._asdict(), high=np.inf)
     for stage, formation, z, forces, tau in ends:
         n_c, scene = formation.n_contacts, formation.scene
         signs = np.zeros(n_c + 2)
@@ -938,6 +942,16 @@ def rest_kernel(formation: Formation) -> Kernel:
     at_joints = ca.vertcat(0, 0, 0, x.tau - friction)
     balance = A.T @ c_n + A_t.T @ c_t + ca.DM(scene.applied_force) + at_joints
     return build_kernel(x, balance=balance)
+
+
+@share
+def brake_kernel(formation: Formation) -> Kernel:
+    """Accelerations of sliding contacts and joints against their directions, from z' = 0."""
+    x = Columns(z=5, a=5).make_symbols()
+    p = Columns(Xi=formation.n_contacts, sigma=2).make_symbols()
+    A_t = formation.function(x.z, ca.SX.zeros(5))[2]
+    slides = (p.Xi * (A_t @ x.a))[list(formation.rubbing_rows), :]
+    return build_kernel(x, p, brake=-ca.vertcat(slides, p.sigma * x.a[3:]))
 
 
 @share
