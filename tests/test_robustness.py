@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import wholearm
+import wholearm.analysis.robustness as robustness
 from planned import forward
 from retelling import Retelling, Units
 from rows import each
@@ -28,7 +29,6 @@ from wholearm import Formation, InputError, Plan, PlanOptions, Problem, Scene, T
 from wholearm.analysis.robustness import (
     Robustness,
     Share,
-    TimeWindow,
     Trial,
     Uncertainty,
     assess_robustness,
@@ -51,7 +51,7 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import NAMES, PARAMETERS
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.simulation.events import EventKind, Simulation
+from wholearm.simulation.events import EventKind, FreeStretch, Simulation
 
 Z = NormalDist().inv_cdf(0.975)
 NONE = dict.fromkeys(("inertia", "friction", "geometry", "start_x", "gain", "delay"), 0.0)
@@ -104,7 +104,7 @@ def test_a_start_that_is_off_closes_the_fingers_there(trial: Trial) -> None:
 def test_what_is_far_off_loses_contacts_and_misses(trial: Trial) -> None:
     record = trial.change({"gain1": -0.3, "gain2": 0.3})
     assert not record["reached"] and not record["kept"]
-    assert record["lost"] in trial.windows[0].contacts and record["phase"] == 1
+    assert record["lost"] in trial.phases[0].formation.names and record["phase"] == 1
 
 
 def test_a_hand_that_cannot_close_is_counted(trial: Trial) -> None:
@@ -166,14 +166,13 @@ def test_bad_options_are_named(
     assert text in capsys.readouterr().err
 
 
-def follow(
-    stretches: list[tuple[str, float, float]], windows: tuple[TimeWindow, ...]
-) -> dict[str, Any]:
+def follow(stretches: list[tuple[str, float, float]], phases: tuple[Any, ...]) -> dict[str, Any]:
     """The verdict on a motion of 1 s in which contacts press as given."""
-    names = tuple(dict.fromkeys(name for window in windows for name in window.contacts))
-    scales = SimpleNamespace(time=0.1, length=1 / 30)
-    scene: Any = SimpleNamespace(scene=SimpleNamespace(scales=scales))
-    trial = Trial(scene, None, np.zeros(5), windows, np.zeros(3), FEW)  # type: ignore[arg-type]
+    names = tuple(dict.fromkeys(name for phase in phases for name in phase.formation.names))
+    stops = tuple((np.arange(len(phases)) + 1) / len(phases))
+    scene = SimpleNamespace(scales=SimpleNamespace(time=0.1, length=1 / 30))
+    problem: Any = SimpleNamespace(scene=scene)
+    trial = Trial(problem, None, np.zeros(5), phases, stops, np.zeros(3), FEW)  # type: ignore[arg-type]
     t = np.linspace(0, 1, 11)
     # "c" strikes at 0.45, if it presses from 0.46 on.
     events = [SimpleNamespace(contact="c", kind=EventKind.IMPACT, time=0.45)]
@@ -183,25 +182,27 @@ def follow(
         z=np.zeros((11, 5)),
         c_n=np.ones((11, len(names))),
         contacts=names,
-        stretches=[
-            SimpleNamespace(contact=name, start=start, stop=stop) for name, start, stop in stretches
-        ],
+        stretches=[FreeStretch(*stretch, least=1.0, time=0.0) for stretch in stretches],
         events=events,
         outcome=SimpleNamespace(kind=None, text=""),
     )
     simulation.list_pauses = partial(Simulation.list_pauses, simulation)
-    return trial.judge(simulation, 0.0, [window.stop for window in windows])
+    return trial.judge(simulation, 0.0, stops)
 
 
-ONE = (TimeWindow(1, 1.0, ("a", "b"), {"c", "d"}, {}),)
-TWO = (
-    TimeWindow(1, 0.5, ("a", "b"), {"c", "d"}, {}),
-    TimeWindow(2, 1.0, ("b", "c"), set(), {"c": {"d"}}),
-)
+def hold(number: int, names: str, gained: str = "", **aliases: str) -> Any:
+    """A phase with contacts of one letter, those that it gains, and what its own go on as."""
+    of = {name: set(aliases.get(name, "")) for name in names}
+    formation = SimpleNamespace(names=names)
+    return SimpleNamespace(number=number, formation=formation, gained=set(gained), aliases=of)
+
+
+ONE = (hold(1, "ab", "cd"),)
+TWO = (hold(1, "ab", "cd"), hold(2, "bc", c="d"))
 
 
 @each(
-    "stretches, windows, lost",
+    "stretches, phases, lost",
     [
         ([("a", 0, 1), ("b", 0, 1)], ONE, None),
         ([("a", 0, 0.4), ("a", 0.40005, 1), ("b", 0, 1)], ONE, None),
@@ -224,10 +225,13 @@ TWO = (
 )
 def test_contacts_have_to_press_while_their_phase_lasts(
     stretches: list[tuple[str, float, float]],
-    windows: tuple[TimeWindow, ...],
+    phases: tuple[Any, ...],
     lost: tuple[str, int, float] | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    record = follow(stretches, windows)
+    monkeypatch.setattr(robustness, "list_gained", lambda _, phase: phase.gained)
+    monkeypatch.setattr(robustness, "list_aliases", lambda _, phase: phase.aliases)
+    record = follow(stretches, phases)
     found = (record["lost"], record["phase"], record["time"]) if record["lost"] else None
     assert found == lost and record["kept"] == (lost is None)
 

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,7 +27,7 @@ from ..common.journal import Journal
 from ..common.parallel import DiedError, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ClosedLoop, Policy
-from ..problem.definition import PARAMETERS, Problem, change_scene, read_widths
+from ..problem.definition import PARAMETERS, Phase, Problem, change_scene, read_widths
 from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
@@ -93,11 +93,9 @@ class Uncertainty:
         The last column is where in a period of the sample-and-hold the torques begin, in [0, 1).
         """
         shares = draw_cube(count, len(self.varied) + 1, seed)
-        centred = 2 * shares[:, :-1] - 1
-        delay = [parameter.name == "delay" for parameter in self.varied]
-        centred[:, delay] = shares[:, :-1][:, delay]
+        low = np.array([0 if parameter.name == "delay" else -1 for parameter in self.varied])
         widths = np.array([self.widths[parameter.name] for parameter in self.varied])
-        return np.column_stack([centred * widths, shares[:, -1]])
+        return np.column_stack([(low + (1 - low) * shares[:, :-1]) * widths, shares[:, -1]])
 
 
 def change_problem(problem: Problem, changes: Mapping[str, float]) -> Problem:
@@ -135,16 +133,6 @@ def change_torques(
     return TorqueProfile(breaks, coefficients)
 
 
-class TimeWindow(NamedTuple):
-    """A phase by the clock of a plan."""
-
-    phase: int  # its number
-    stop: float  # [s]
-    contacts: tuple[str, ...]  # that it is planned with
-    gained: Collection[str]  # that it ends with, as of `list_gained`
-    aliases: Mapping[str, set[str]]  # as of `list_aliases`
-
-
 @dataclass(frozen=True, eq=False)
 class Trial:
     """What is tried: a plan or one phase of it, with numbers that are off."""
@@ -154,7 +142,8 @@ class Trial:
     # (5,): configuration at the start, at rest. Where numbers are off the object is put on the palm
     # at the same x and phi, and the fingers are closed on it.
     state: Array
-    windows: tuple[TimeWindow, ...]
+    phases: tuple[Phase, ...]
+    stops: tuple[float, ...]  # [s]: when they end, by the clock of the plan
     goal: Array  # (3,): the pose that is planned for the end
     uncertainty: Uncertainty
     # what the torques are by, instead of the clock; its period is that of the samples
@@ -186,20 +175,20 @@ class Trial:
         else:
             gains = (1 + changes.get("gain1", 0.0), 1 + changes.get("gain2", 0.0))
             delay = changes.get("delay", self.policy.settings.delay)
-            what = ClosedLoop(self.policy, self.windows[0].phase, delay, gains)
+            what = ClosedLoop(self.policy, self.phases[0].number, delay, gains)
         try:
             simulation = self.simulate(changes, what, self.uncertainty.tolerance)
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
         if not isinstance(what, ClosedLoop):
             late = changes.get("delay", 0.0)
-            return self.judge(simulation, 0.0, [window.stop + late for window in self.windows])
+            return self.judge(simulation, 0.0, [stop + late for stop in self.stops])
         # A phase begins when its first torques take effect; the last one goes on to the end.
         end = float(simulation.t[-1])
         began = {number: time + what.delay for number, time in what.began.items()}
-        began[self.windows[-1].phase + 1] = end
-        stops = [began.get(window.phase + 1, math.inf) for window in self.windows]
-        return self.judge(simulation, began.get(self.windows[0].phase, end), stops)
+        began[self.phases[-1].number + 1] = end
+        stops = [began.get(phase.number + 1, math.inf) for phase in self.phases]
+        return self.judge(simulation, began.get(self.phases[0].number, end), stops)
 
     def simulate(
         self,
@@ -218,7 +207,7 @@ class Trial:
             raise SimulationError(f"the hand cannot close at the start: {text}")
         until = None
         if isinstance(torque, ClosedLoop):
-            until = torque.find_limit(self.windows[-1].phase)
+            until = torque.find_limit(self.phases[-1].number)
         return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
     def judge(self, simulation: Simulation, began: float, stops: Sequence[float]) -> dict[str, Any]:
@@ -230,25 +219,28 @@ class Trial:
         """
         unit, t = self.problem.scene.scales.time, simulation.t
         losses, least = list[tuple[float, int, str]](), math.inf
-        for window, planned in zip(self.windows, stops, strict=True):
-            gains = [s.start for s in simulation.stretches if s.contact in window.gained]
+        for phase, planned in zip(self.phases, stops, strict=True):
+            gained, aliases = list_gained(self.problem, phase), list_aliases(self.problem, phase)
+            gains = [one.start for one in simulation.stretches if one.contact in gained]
             gain = min((time for time in gains if time > began), default=math.inf)
-            stop = min(planned, find_touch(simulation, window.gained, began))
-            for name in window.contacts:
+            stop = min(planned, find_touch(simulation, gained, began))
+            for name in phase.formation.names:
                 c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))
-                pauses = simulation.list_pauses(name, began, stop, window.aliases.get(name, ()))
-                if pauses and pauses[0][0] <= began:
-                    pauses = [pause for pause in pauses if pause[1] > began + MOMENT * unit]
-                lasting = [first for first, after in pauses if after - first > 1e-3 * unit]
-                losses += [(first, window.phase, name) for first in lasting]
-            began = max(planned, gain) if window.gained else planned
+                pauses = simulation.list_pauses(name, began, stop, aliases[name])
+                closed = began + MOMENT * unit if pauses and pauses[0][0] <= began else began
+                losses += [
+                    (first, phase.number, name)
+                    for first, after in pauses
+                    if after > closed and after - first > 1e-3 * unit
+                ]
+            began = max(planned, gain) if gained else planned
             if began > t[-1]:
                 # What ends the whole motion may be a little short: that is for the goal to say.
-                if window is not self.windows[-1]:
-                    losses.append((planned, window.phase, min(window.gained, default="")))
+                if phase is not self.phases[-1]:
+                    losses.append((planned, phase.number, min(gained, default="")))
                 break
-        time, phase, lost = min(losses, default=(None, None, ""))
+        time, number, lost = min(losses, default=(None, None, ""))
         off = simulation.z[-1, :3] - self.goal
         distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
         near = distance <= self.uncertainty.find_distance(self.problem.scene)
@@ -262,7 +254,7 @@ class Trial:
             "reached": near and not given_up,
             "kept": not lost and not given_up,
             "lost": lost,
-            "phase": phase,
+            "phase": number,
             "time": time,
             "least": least,
             "path": path.tolist(),
@@ -296,22 +288,14 @@ def make_trial(
         text = f"{phase} given; it does not start at rest, so that it is no trial of its own"
         raise InputError("", "--phase", text)
     begin = float(starts[first])
-    windows = tuple(
-        TimeWindow(
-            part.number,
-            float(starts[part.index + 1]) - begin,
-            tuple(part.formation.names),
-            list_gained(problem, part),
-            list_aliases(problem, part),
-        )
-        for part in problem.phases[first : last + 1]
-    )
+    stops = tuple((starts[first + 1 : last + 2] - begin).tolist())
     torque = plan.torque.cut(begin, float(starts[last + 1]))
     torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
     goal = plan.q[rows[-1]]
     if policy is not None:
         policy = policy.cut(last + 1)
-    return Trial(problem, torque, plan.z[rows[0]], windows, goal, uncertainty, policy)
+    phases = problem.phases[first : last + 1]
+    return Trial(problem, torque, plan.z[rows[0]], phases, stops, goal, uncertainty, policy)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -364,7 +348,7 @@ class Robustness(Result):
     def document(self) -> Document:
         """How many samples reach the goal, what is lost first, and what matters most."""
         trial, count, least = self.trial, len(self.records), self.sensitivities
-        phases = [window.phase for window in trial.windows]
+        phases = [phase.number for phase in trial.phases]
         place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
         many = f"{count} of {self.known}" if self.known > count else f"{count}"
         near = 1e3 * trial.uncertainty.find_distance(trial.problem.scene)
@@ -408,7 +392,7 @@ class Robustness(Result):
         keys = ("parameter", "unit", "range", "slope")
         return {
             "problem": trial.problem.name,
-            "phases": [window.phase for window in trial.windows],
+            "phases": [phase.number for phase in trial.phases],
             "samples": len(self.records),
             "seed": self.seed,
             "ranges": trial.uncertainty.widths,
@@ -501,7 +485,7 @@ def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
         "policy": None if policy is None else _digest(arrays),
         "pace": None if policy is None else policy.settings._asdict(),
         "sensor": policy is not None and policy.sensor,
-        "phases": [window.phase for window in trial.windows],
+        "phases": [phase.number for phase in trial.phases],
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
@@ -544,7 +528,7 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
 
     The least value of a smooth force changes like the force where it is least, whenever that is.
     """
-    contact, time, least = find_least(trial.simulate({}, trial.torque), trial.windows)
+    least, contact, time = find_least(trial)
     sensitivities = []
     for parameter in trial.uncertainty.varied if contact else ():
         width = trial.uncertainty.widths[parameter.name]
@@ -565,23 +549,20 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
     return Sensitivities(contact, time, least, tuple(sensitivities))
 
 
-def find_least(simulation: Simulation, windows: tuple[TimeWindow, ...]) -> tuple[str, float, float]:
-    """The planned contact that presses least, when, and its c_n; none has no name."""
-    t = simulation.t
+def find_least(trial: Trial) -> tuple[float, str, float]:
+    """The least c_n of a planned contact [N], which, and when [s]; NaN and no name for none."""
+    simulation, start = trial.simulate({}, trial.torque), 0.0
+    t, forces = simulation.t, list[tuple[float, str, float]]()
     events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])
     # Where a contact slides the other way forces step, at another time when numbers are off.
     apart = np.abs(t[:, None] - events).min(axis=1) > 0.01 * t[-1]
-    least, start = ("", math.nan, math.nan), 0.0
-    for window in windows:
-        for name in window.contacts:
+    for phase, stop in zip(trial.phases, trial.stops, strict=True):
+        for name in phase.formation.names:
             c_n = simulation.c_n[:, simulation.contacts.index(name)]
-            here = np.flatnonzero(apart & (t > start) & (t < window.stop) & (c_n == c_n))
-            if len(here):
-                row = here[c_n[here].argmin()]
-                if not c_n[row] >= least[2]:
-                    least = (name, float(t[row]), float(c_n[row]))
-        start = window.stop
-    return least
+            rows = np.flatnonzero(apart & (t > start) & (t < stop) & (c_n == c_n))
+            forces += [(float(c_n[row]), name, float(t[row])) for row in rows]
+        start = stop
+    return min(forces, key=lambda force: force[0], default=(math.nan, "", math.nan))
 
 
 @dataclass(frozen=True)
