@@ -19,7 +19,6 @@ from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
-from ..contacts.contact_limits import takes_over
 from ..geometry.tracing import EndDistance
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
@@ -28,7 +27,7 @@ from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
-from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
+from ..verification import free
 from ..verification.verdict import DEPARTURE
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
@@ -130,28 +129,6 @@ class Passage:
         """What ends it."""
         return self.phases[-1].until
 
-    def follow(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
-        """When its phases end [s], as far as they do, and the first loss of a contact before.
-
-        Events end a phase that gains or releases a contact; a coordinate that ends one is no event.
-        """
-        ends: list[float] = []
-        gains = EventKind.GAINED, EventKind.IMPACT, EventKind.PASS
-        for event in events:
-            phase, after = self.phases[len(ends)], (*self.phases[1:], self.after)[len(ends)]
-            until, lost = phase.until, event.kind is EventKind.CONTACT_LOST
-            if until.contact is not None:
-                is_end = event.kind in gains and event.contact == until.contact.name
-            else:
-                is_end = until.is_release and lost and event.contact in list_leaving(phase, after)
-            if is_end:
-                ends.append(event.time)
-                if len(ends) == len(self.phases):
-                    break
-            elif lost and event.contact in phase.formation.names:
-                return ends, event
-        return ends, None
-
 
 def split_passages(problem: Problem) -> list[Passage]:
     """The phases of a problem, those together that are carried in one motion."""
@@ -160,9 +137,8 @@ def split_passages(problem: Problem) -> list[Passage]:
     for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
         phases.append(phase)
         # A contact that goes on as the one which ends the phase is carried on in motion.
-        gained, leaving = phase.until.contact, list_leaving(phase, after)
-        ending = [contact for contact in phase.formation.contacts if contact.name in leaving]
-        moves = gained is not None and takes_over(gained, problem.scene, ending)
+        contact = phase.until.contact
+        moves = contact is not None and contact.name not in free.list_gained(problem, phase)
         if after is None or (phase.end is End.REST and not moves):
             passages.append(Passage(tuple(phases), after))
             phases = []
@@ -211,7 +187,7 @@ class Tuning(Result):
     # (n, 3): the table of t and both torques, a repeated time being a step; None if a phase failed
     rows: Array | None = field(repr=False)
     # of the whole, simulated without telling which contacts hold
-    report: FreeReport | None = field(repr=False)
+    report: free.FreeReport | None = field(repr=False)
     reason: str  # the one sentence behind the verdict
 
     derived = ("ok", "exit_status", "reason", "simulations", "duration")
@@ -316,7 +292,7 @@ def tune(
                 clock += part.duration + SETTINGS.pause * problem.scene.scales.time
                 z = part.end
     rows = make_rows(steps, clock)
-    report = verify_free(problem, TorqueProfile.join_rows(rows))
+    report = free.verify_free(problem, TorqueProfile.join_rows(rows))
     return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
@@ -388,12 +364,10 @@ class PassageTuner:
         ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
         path, left = paths[k], ends[k] - ends[-1] / 2
-        middle = path.point.z[int(np.searchsorted(path.s, path.length - left))]
-        way = abs(middle - path.point.z[0])
-        turns = way[2] * self.problem.scene.scales.length > way[0]
-        name, value = ("phi", middle[2]) if turns else ("x", middle[0])
-        until = Until(coordinate=name, value=float(value))
-        part = replace(phases[k], until=until, end=End.REST)
+        x, _, phi = path.point.z[int(np.searchsorted(path.s, path.length - left)), :3].tolist()
+        middle = Until(coordinate="x", value=x, pins=(("phi", phi),))
+        until = middle.lead(path.point.z[0], self.problem.scene.scales.length)
+        part = replace(phases[k], until=replace(until, pins=()), end=End.REST)
         first = Passage((*phases[:k], part), phases[k])
         return first, Passage(phases[k:], self.passage.after)
 
@@ -565,8 +539,6 @@ class PassageTuner:
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
             for drive in chosen:
-                if self.is_exhausted:
-                    return None
                 braking = self._lower(drive.trial, first, supported)
                 if braking is not None:
                     return drive, braking
@@ -661,7 +633,7 @@ class PassageTuner:
         grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
         runs = [run(at) for at in grid]
         k = min(range(1, SETTINGS.grid - 1), key=lambda k: runs[k][0])
-        low, at, high = grid[k - 1 : k + 2]
+        at, ends = grid[k], (grid[k - 1], grid[k + 1])
         rate, best = runs[k]
         if rate > min(runs[k - 1][0], runs[k + 1][0]):
             return None
@@ -670,14 +642,13 @@ class PassageTuner:
                 return best
             if count == SETTINGS.grid and rate > 2 * SETTINGS.coarse * self.slow:
                 return None
-            left = at - low > high - at
-            other = at + (3 - math.sqrt(5)) / 2 * (low - at if left else high - at)
+            near, far = sorted(ends, key=lambda end: abs(end - at))
+            other = at + (3 - math.sqrt(5)) / 2 * (far - at)
             new, trial = run(other)
             if new < rate:
-                low, high = (low, at) if left else (at, high)
-                at, rate, best = other, new, trial
+                ends, at, rate, best = (at, far), other, new, trial
             else:
-                low, high = (other, high) if left else (low, other)
+                ends = near, other
         return None
 
     def _overshoot(self, trial: TuningTrial, slow: float) -> float:
@@ -710,13 +681,14 @@ class PassageTuner:
             self.problem, TorqueProfile.join_rows(make_rows(steps, end)), start=self.z
         )
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
-        parted = {
-            name: max((b - a for a, b in simulation.list_pauses(name, arrival, end)), default=0.0)
+        pauses = [
+            (last - first, name)
             for name in names
-        }
-        worst = max(parted, key=parted.__getitem__)
-        if parted[worst] > REST_WINDOW * self.time:
-            reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
+            for first, last in simulation.list_pauses(name, arrival, end)
+        ]
+        longest, worst = max(pauses, key=lambda pause: pause[0], default=(0.0, ""))
+        if longest > REST_WINDOW * self.time:
+            reason = f"{worst} parts for {1e3 * longest:.3g} ms"
         elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
             reason = "the object does not come to rest there"
         return simulation.z[-1], reason
@@ -724,7 +696,7 @@ class PassageTuner:
     def _is_over(self, run: FreeRun) -> bool:
         if run.t == 0:
             return False
-        ends, loss = self.passage.follow(run.events)
+        ends, loss = self.find_ends(run.events)
         if run.resting or loss is not None or len(ends) == len(self.passage.phases):
             return True
         if len(self.passage.phases) > 1:
@@ -732,42 +704,57 @@ class PassageTuner:
         gap = float(self.measure(run.z[None])[0])
         return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
 
+    def find_ends(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
+        """When the phases end [s], as far as they do, and the first loss of a contact before.
+
+        Events end a phase that gains or releases a contact; a coordinate that ends one is no event.
+        """
+        ends: list[float] = []
+        for event in events:
+            phase, lost = self.passage.phases[len(ends)], event.kind is EventKind.CONTACT_LOST
+            if phase.until.contact is not None:
+                is_end = event.kind in free.TOUCHES and event.contact == phase.until.contact.name
+            else:
+                leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else ()
+                is_end = lost and event.contact in leaving
+            if is_end:
+                ends.append(event.time)
+                if len(ends) == len(self.passage.phases):
+                    break
+            elif lost and event.contact in phase.formation.names:
+                return ends, event
+        return ends, None
+
     def _judge(self, steps: tuple[TuningStep, ...], simulation: Simulation) -> TuningTrial:
-        gaps = self.measure(simulation.z)
-        ends, lost = self.passage.follow(simulation.events)
-        arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
+        gaps, phases = self.measure(simulation.z), self.passage.phases
+        ends, lost = self.find_ends(simulation.events)
+        arrival = ends[-1] if len(ends) == len(phases) else math.inf
         if not self.gains and gaps.min() <= 0:
             row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
             a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
             arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
-        before = len(self.passage.phases) - 1
-        start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
+        starts = [0.0, *ends][: len(phases)]
+        start = starts[-1] if len(starts) == len(phases) else math.inf  # of the last phase
         # When the end, once nearer, is farther away again.
-        rows = np.flatnonzero(simulation.t >= start)
-        risen = gaps[rows] - np.minimum.accumulate(gaps[rows])
-        back = rows[risen > SETTINGS.back * abs(self.way)]
-        turn = float(simulation.t[back].min(initial=math.inf))
+        near = np.minimum.accumulate(np.where(simulation.t >= start, gaps, math.inf))
+        back = simulation.t[gaps - near > SETTINGS.back * abs(self.way)]
+        turn = float(back.min(initial=math.inf))
         stop = min(arrival, turn, float(simulation.t[-1]))
         # When contacts of its phases part, also those that never press.
         losses = [] if lost is None else [(lost.time, lost.contact)]
-        starts = [0.0, *ends][: len(self.passage.phases)]
-        spans = zip(self.passage.phases, starts, [*starts[1:], stop], strict=False)
-        for phase, first, last in spans:
-            phase_losses = find_losses(simulation, phase, first, last, DEPARTURE)
-            losses += [(loss.time, loss.contact) for loss in phase_losses]
+        for phase, first, last in zip(phases, starts, [*starts[1:], stop], strict=False):
+            parted = free.find_losses(simulation, phase, first, last, DEPARTURE)
+            losses += [(loss.time, loss.contact) for loss in parted]
         losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(simulation.t, time))
+        t, c_n, gaps = (part[: at + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
         # The step in which a coordinate arrives goes on beyond that.
-        t, c_n = simulation.t[: at + 1].copy(), simulation.c_n[: at + 1].copy()
-        gaps = gaps[: at + 1].copy()
-        if t[at] > time > 0:
+        if t[at] > time:
             sample, t[at] = simulation.trajectory.at([time]), time
-            gaps[at] = self.measure(sample.z)[0]
-            pairs = [simulation.trajectory.contacts.index(name) for name in simulation.contacts]
-            c_n[at] = sample.c_n[0, pairs]
-        least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
+            gaps[at], c_n[at] = self.measure(sample.z)[0], sample.c_n[0]
         short = float(gaps[t >= start].min(initial=math.inf))
+        least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
         if losses:
             outcome = TrialOutcome.LOSES
         elif least < self.problem.epsilon:
@@ -779,8 +766,7 @@ class PassageTuner:
             outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
         z, v, z_ddot = (part[[at]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
         if not self.gains and time > 0:
-            sample = simulation.trajectory.at([time])
-            z, v, z_ddot = sample.z, sample.z_dot, sample.z_ddot
+            z, v, z_ddot = simulation.trajectory.at([time])[:3]
         _, (gradient,), (bend,) = self.end.evaluate(z, v)
         rate, slowing = -float(gradient @ v[0]), float(gradient @ z_ddot[0] + bend)
         at_last = contact, rate, slowing, short, least, weakest, z[0]
@@ -792,15 +778,12 @@ class PassageTuner:
         """The least of normal forces over time, of which contact, and in which row."""
         phases = self.passage.phases
         of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
-        best = (math.inf, phases[0].formation.names[0], 0)
-        for index, after in enumerate((*phases[1:], self.passage.after)):
-            phase, rows = phases[index], np.flatnonzero(of == index)
+        names = list(dict.fromkeys(name for phase in phases for name in phase.formation.names))
+        c_n = np.nan_to_num(forces[:, [contacts.index(name) for name in names]], nan=math.inf)
+        for index, phase in enumerate(phases):
             # Contacts that the phase releases at its end do not count.
-            leaving = list_leaving(phase, after) if phase.until.is_release else set()
-            names = [name for name in phase.formation.names if name not in leaving]
-            columns = [contacts.index(name) for name in names]
-            c_n = np.nan_to_num(forces[rows][:, columns], nan=math.inf)
-            if c_n.min(initial=math.inf) < best[0]:
-                row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
-                best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
-        return best
+            leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else set()
+            others = [name in leaving or name not in phase.formation.names for name in names]
+            c_n[np.ix_(of == index, others)] = math.inf
+        row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
+        return float(c_n[row, column]), names[int(column)], int(row)

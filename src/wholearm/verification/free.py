@@ -8,7 +8,7 @@ With torques alone a phase ends where its `until` is reached, and with a policy 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
+TOUCHES = EventKind.IMPACT, EventKind.GAINED, EventKind.PASS  # with which a contact touches
 REACHED, TURNED = 0.03, math.radians(1.0)
 """How far from the plan's end a policy may end: over the scene's length, and in rad."""
 
@@ -215,9 +216,8 @@ def _follow(simulation: Simulation, allowed: float) -> tuple[tuple[FreePhase, ..
     problem, phases = simulation.problem, list[FreePhase]()
     failures: list[str] = []
     start = float(simulation.t[0])
-    following: Sequence[Phase | None] = [*problem.phases[1:], None]
-    for phase, after in zip(problem.phases, following, strict=True):
-        stop = _find_end(simulation, phase, after, start)
+    for phase in problem.phases:
+        stop = _find_end(simulation, phase, start)
         last = float(simulation.t[-1]) if stop is None else stop
         losses = find_losses(simulation, phase, start, last, allowed)
         phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
@@ -233,9 +233,7 @@ def _follow(simulation: Simulation, allowed: float) -> tuple[tuple[FreePhase, ..
     return tuple(phases), failures
 
 
-def _find_end(
-    simulation: Simulation, phase: Phase, after: Phase | None, start: float
-) -> float | None:
+def _find_end(simulation: Simulation, phase: Phase, start: float) -> float | None:
     """When a phase ends, None if it does not [s]."""
     until, rows = phase.until, np.flatnonzero(simulation.t >= start)
     later = [event for event in simulation.events if event.time >= start]
@@ -249,7 +247,7 @@ def _find_end(
         times = simulation.t[rows[reached][:1]].tolist()
     else:
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
-        times = [e.time for e in lost if e.contact in list_leaving(phase, after)]
+        times = [e.time for e in lost if e.contact in list_leaving(simulation.problem, phase)]
     return min(times, default=None)
 
 
@@ -269,15 +267,15 @@ def find_touch(simulation: Simulation, contacts: Collection[str], start: float) 
 
     An impact may lift other contacts, before the one that strikes presses for good.
     """
-    kinds = EventKind.IMPACT, EventKind.GAINED
-    times = [e.time for e in simulation.events if e.kind in kinds and e.contact in contacts]
+    times = [e.time for e in simulation.events if e.kind in TOUCHES and e.contact in contacts]
     times += [s.start for s in simulation.stretches if s.contact in contacts]
     return min((time for time in times if time > start), default=math.inf)
 
 
-def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
+def list_leaving(problem: Problem, phase: Phase) -> set[str]:
     """Contacts of a phase that the next one does not have."""
-    return set(phase.formation.names) - set(() if after is None else after.formation.names)
+    following = problem.phases[phase.number : phase.number + 1]
+    return set(phase.formation.names).difference(*(after.formation.names for after in following))
 
 
 def list_aliases(problem: Problem, phase: Phase) -> dict[str, set[str]]:
