@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -25,9 +26,7 @@ from ..contacts.closing import ClosedFinger, close_fingers, first_contact, lower
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
-# Parts of an interval in which changes of labels are looked for, and how often it is divided: up to
-# rounding of its ends.
-PARTS, ROUNDS = 16, 13
+PARTS = 16  # of an interval in which a change of labels is looked for
 LONGEST = 0.06  # longest step in x between points of a border, in radii of gyration
 NOWHERE = -1  # fills the labels of places that are no border
 
@@ -279,41 +278,66 @@ def _label(
 
 def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
     """Cut tracks into pieces with one label each, by multisection; only those in the window."""
-    if not tracks:
-        return []
-    owner = np.repeat(np.arange(len(tracks)), [len(track.places) for track in tracks])
-    places = np.concatenate([track.places for track in tracks])
-    labels = _label(scene, tracks, window, owner, places)
-    firsts = labels[np.flatnonzero(np.diff(owner, prepend=-1))]
-    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & (owner[1:] == owner[:-1]))
-    # Of each change the track, the places before and after it, and their labels.
-    owner, ends = owner[changed], np.column_stack([places[changed], places[changed + 1]])
-    pair = np.stack([labels[changed], labels[changed + 1]], axis=1)
-    for _ in range(ROUNDS):
-        low, high = ends.T[..., None]
-        inner = low + (high - low) * np.arange(1, PARTS) / PARTS
-        seen = _label(scene, tracks, window, np.repeat(owner, PARTS - 1), inner.ravel())
-        seen = np.concatenate([pair[:, :1], seen.reshape(*inner.shape, 6), pair[:, 1:]], axis=1)
-        places = np.hstack([low, inner, high])
-        differs = (seen[:, 1:] != seen[:, :-1]).any(axis=2)
-        # What follows the first change to the last label is rounding.
-        first = differs.argmax(axis=1)
-        direct = (seen[np.arange(len(seen)), first + 1] == pair[:, 1]).all(axis=1)
-        differs &= ~direct[:, None] | (np.arange(PARTS) == first[:, None])
-        rows, k = np.nonzero(differs)
-        owner, ends = owner[rows], np.column_stack([places[rows, k], places[rows, k + 1]])
-        pair = np.stack([seen[rows, k], seen[rows, k + 1]], axis=1)
-    pieces = []
-    for index, track in enumerate(tracks):
-        mine = owner == index
-        stops = [track.places[0], *ends[mine].ravel(), track.places[-1]]
-        held = [firsts[index], *pair[mine, 1]]
+    label_places = partial(_label, scene, tracks, window)
+    sizes = [len(track.places) for track in tracks]
+    owners = np.repeat(np.arange(len(tracks)), sizes)
+    places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
+    labels = label_places(owners, places)
+    changes = _find_changes(label_places, owners, places, labels)
+    pieces, first = [], 0
+    for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
+        rows, first = slice(first, first + size), first + size
+        start, held = float(places[rows][0]), labels[rows][0]
+        parts = []
+        for before, after, following in changes.get(index, ()):
+            parts.append((start, before, held))
+            start, held = after, following
+        parts.append((start, float(places[rows][-1]), held))
         pieces += [
             Piece(track, _fill(track, low, high), label)
-            for low, high, label in zip(stops[::2], stops[1::2], held, strict=True)
+            for low, high, label in parts
             if label[0] != NOWHERE and high > low
         ]
     return pieces
+
+
+def _find_changes(
+    label_places: Callable[[Numbers, Array], Numbers],
+    owners: Numbers,
+    places: Array,
+    labels: Numbers,
+) -> dict[int, list[tuple[float, float, Numbers]]]:
+    """Changes of labels by track: last place with the old one, first with the new, and the new."""
+    within = owners[1:] == owners[:-1]
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
+    low, high, owner = places[changed], places[changed + 1], owners[changed]
+    old, last = labels[changed], labels[changed + 1]
+    track_changes: dict[int, list[tuple[float, float, Numbers]]] = {}
+    # Eight changes between two neighbouring places at most.
+    for _ in range(8):
+        if not len(low):
+            break
+        stop = high
+        for _ in range(13):
+            inner = low[:, None] + (high - low)[:, None] * np.arange(1, PARTS) / PARTS
+            seen = label_places(np.repeat(owner, PARTS - 1), inner.ravel())
+            same = (seen.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)
+            first = np.where(same.all(axis=1), PARTS - 1, same.argmin(axis=1))
+            ends = np.column_stack([low, inner, high])
+            rows = np.arange(len(ends))
+            low, high = ends[rows, first], ends[rows, first + 1]
+        new = label_places(owner, high)
+        for k, before, after, label in zip(
+            owner.tolist(), low.tolist(), high.tolist(), new, strict=True
+        ):
+            track_changes.setdefault(k, []).append((before, after, label))
+        # A second change may hide behind the first.
+        more = (new != last).any(axis=1) & (high < stop)
+        low, high, old, last = high[more], stop[more], new[more], last[more]
+        owner = owner[more]
+    return {
+        k: sorted(changes, key=lambda change: change[0]) for k, changes in track_changes.items()
+    }
 
 
 def _fill(track: Track, low: float, high: float) -> Array:
