@@ -141,11 +141,6 @@ def test_centroid_and_inertia_equal_quadrature(seed: int) -> None:
     np.testing.assert_allclose(polygon.vertices, corners - centroid, atol=1e-13)
 
 
-def test_given_inertia_is_kept_and_points_may_be_lists() -> None:
-    polygon = Polygon(SQUARE, 1, 0.25)
-    assert (polygon.mass, polygon.inertia, polygon.n_vertices) == pytest.approx((1.0, 0.25, 4))
-
-
 def test_arrays_are_read_only_copies() -> None:
     corners = np.array(SQUARE)
     polygon = Polygon(corners, 1.0)
@@ -183,8 +178,9 @@ def test_bad_polygon_names_the_corner(points: Any, key: str, text: str) -> None:
     assert caught.value.key == key
 
 
-def test_size_and_uniform_inertia() -> None:
-    polygon = Polygon(np.array([[0, 0], [3, 0], [3, 4], [0, 4]]), 2.0, 1.0)
+def test_size_and_inertia_of_points_in_lists() -> None:
+    polygon = Polygon([[0, 0], [3, 0], [3, 4], [0, 4]], 2, 1.0)
+    assert (polygon.mass, polygon.inertia, polygon.n_vertices) == (2.0, 1.0, 4)
     assert polygon.size == pytest.approx(5.0, rel=1e-13)
     assert polygon.uniform_inertia == pytest.approx(2.0 * 25 / 12, rel=1e-14)
 
