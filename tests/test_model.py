@@ -180,8 +180,8 @@ def test_bad_polygon_names_the_corner(points: Any, key: str, text: str) -> None:
 
 def test_size_and_inertia_of_points_in_lists() -> None:
     polygon = Polygon([[0, 0], [3, 0], [3, 4], [0, 4]], 2, 1.0)
-    assert (polygon.mass, polygon.inertia, polygon.n_vertices) == (2.0, 1.0, 4)
-    assert polygon.size == pytest.approx(5.0, rel=1e-13)
+    known = polygon.mass, polygon.inertia, polygon.n_vertices, polygon.size
+    assert known == pytest.approx((2.0, 1.0, 4, 5.0), rel=1e-13)
     assert polygon.uniform_inertia == pytest.approx(2.0 * 25 / 12, rel=1e-14)
 
 

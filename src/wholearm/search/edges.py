@@ -371,7 +371,7 @@ def edge_along(
     With speed `ratios` the speed is continuous where two borders meet.
     """
     start, last = borders[0].start, borders[-1].limits
-    reason = last.closed or ("" if len(borders) > 1 else last.begins)
+    reason = last.closed or borders[0].limits.begins
     if reason:
         return Blocked(start, steps, reason, stop, borders[0])
     duration: float | str = last.ends

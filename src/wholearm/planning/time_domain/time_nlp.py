@@ -245,7 +245,7 @@ def build_time_nlp(
     if stages[0].periods:
         add_periods(rows, stages, layouts)
     if held:
-        hold_ends(rows, stages, layouts, target.epsilon)
+        hold_ends(rows, stages, layouts, scheme, target.epsilon)
     if target.chained:
         cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
@@ -540,7 +540,11 @@ def join_motors(
 
 
 def hold_ends(
-    rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout], epsilon: float
+    rows: NlpRows,
+    stages: Sequence[Stage],
+    layouts: Sequence[StageLayout],
+    scheme: Scheme,
+    epsilon: float,
 ) -> None:
     """Torques hold the object at rest at the ends of a motion, and where it stops between phases.
 
@@ -555,10 +559,11 @@ def hold_ends(
             ends.append((stage, stage.formation, z[0], layout.begin, tau[0, 0]))
         if len(layout.finish):
             ends.append((stage, stage.ending, z[1], layout.finish, tau[-1, -1]))
-            # Case: phase 11 of query 15, whose end no torques hold otherwise.
-            columns = {"z": z[1], "a": layout.a[-1, -1]}
-            brake = brake_kernel(stage.formation)
-            rows.add_copies(brake, columns, stage.directions._asdict(), high=np.inf)
+            if scheme.ends:
+                # Case: phase 11 of query 15, whose end no torques hold otherwise.
+                columns = {"z": z[1], "a": layout.a[-1, -1]}
+                brake = brake_kernel(stage.formation)
+                rows.add_copies(brake, columns, stage.directions._asdict(), high=np.inf)
     for stage, formation, z, forces, tau in ends:
         n_c, scene = formation.n_contacts, formation.scene
         signs = np.zeros(n_c + 2)
