@@ -15,8 +15,9 @@ from scipy.optimize import linprog
 from plane import SQUARE, make_formation, make_scene, with_speed_limit
 from rows import each
 from scenes import roll
+from shipped import BOX
 from toys import plan_path
-from wholearm import Finger, Objective, Polygon, Scene
+from wholearm import Finger, Objective, Polygon, Scene, load
 from wholearm.common.arrays import Array, find_minima
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.closing import contact_table
@@ -35,7 +36,7 @@ from wholearm.planning.path_domain.path_data import choose_sampling, prepare
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.time_motion import TimeMotion
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.make import make_rows
 from wholearm.problem.definition import End, Phase, Problem, Until
@@ -160,6 +161,28 @@ def test_another_limit_binds_over_time(
         assert misses.held[:, ~of_motors].max() < 2 * SETTINGS.miss
         worst.append(misses.held[:, of_motors].max())
     assert max(worst) == pytest.approx(before - 1, rel=2e-2)
+
+
+def test_a_contact_that_begins_to_slide_is_inside_its_cone_until_then() -> None:
+    """Under rate limits, between the points too; the last force is one of sliding."""
+    problem = load(str(BOX))
+    start = trace_phase(problem.phases[0], problem.start).end
+    (plan,) = plan_phases(problem, problem.phases[1:2], start, COARSE)
+    part = plan.motion.stages[-1]
+    assert isinstance(part, StageMotion)
+    (row,), last = part.formation.rolling_rows, part.breaks[-2:]
+    samples = part.evaluate(np.linspace(*last, 2001))
+    used = np.abs(samples.c_t[:, row]) / samples.c_n[:, row]
+    least = 0.9 * float(used.max())
+    weak = problem.with_(friction_palm=least, torque_rate_limit=1e4)
+    formation = replace(part.formation, scene=weak.scene)
+    stage = Stage(1, formation, part.directions, part.points, fading=((row, 1.0),))
+    held = find_misses(stage, check_between(stage, part), EPSILON).held[-1]
+    limits = make_limits(formation, EPSILON)
+    cones = np.isin(limits.sides[0], limits.of(CONE))
+    short = (np.abs(samples.c_t[:, row]) - least * samples.c_n[:, row]).max()
+    assert short > 0.0
+    assert held[cones].max() * limits.side_scales[cones][0] == pytest.approx(short, rel=1e-3)
 
 
 @pytest.mark.usefixtures("motors")

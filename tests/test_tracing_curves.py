@@ -21,7 +21,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import POINTS, PathGuess, guess_phase
-from wholearm.geometry.tracing import EndDistance, trace_curve, trace_phases
+from wholearm.geometry.tracing import EndDistance, trace_curve, trace_phase, trace_phases
 from wholearm.mechanics.dynamics import close_contacts, metric_weights
 from wholearm.planning.time_domain.time_plan import plan_phases
 
@@ -120,6 +120,17 @@ def test_curve_equals_an_integration_of_its_tangent(every_curve: tuple[Curve, ..
         span, accuracy = (0, curve.length), {"rtol": 1e-13, "atol": 1e-15}
         reference = solve_ivp(slope, span, curve.start, "DOP853", t_eval=s, **accuracy)
         np.testing.assert_allclose(curve.evaluate(s).z, reference.y.T, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("missed", [0.0, 1e-8, -1e-8])
+def test_a_curve_begins_where_one_before_ends_up_to_a_tolerance(
+    heptagon: Problem, curves: tuple[Curve, ...], missed: float
+) -> None:
+    """The contact that is given up there opens, though closing the others presses it in [m]."""
+    before, (phase, *later) = curves[3], heptagon.phases[4:]
+    (z,) = before.interpolate(np.array([before.length - missed]))[0]
+    curve, exact = (trace_phase(phase, start, later) for start in (z, before.end))
+    assert curve.length == pytest.approx(exact.length, rel=1e-5)
 
 
 def test_tangent_and_curvature_are_derivatives(every_curve: tuple[Curve, ...]) -> None:

@@ -185,12 +185,15 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     wanted = [len(names) - 1] if until.contact is None else wanted
     end_distance = EndDistance(formation.scene, until, z)
 
+    panels: list[Panel] = []
+
     def margins(points: Array) -> Array:
         # Where a contact is gained is among the limits.
         left = end_distance.measure(points) if until.contact is None else np.ones(len(points))
-        return np.column_stack([formation.evaluate_limits(points) / rho, left])
-
-    panels: list[Panel] = []
+        values = formation.evaluate_limits(np.vstack([panels[0].z[:1], points])) / rho
+        # A plan ends at a crossing to its own tolerance: what is closed there counts from there.
+        # Case: phase 5 of `heptagon.toml` with periods of 5 ms, with v0-finger2 9e-10 below zero.
+        return np.column_stack([values[1:] - np.clip(values[0], -TOUCHING, 0.0), left])
 
     def end(s: float, text: str, reached: bool = False) -> Curve:
         return Curve(formation, tuple(panels), s, text, reached)

@@ -606,11 +606,13 @@ def find_misses(
     limits = make_limits(formation, epsilon)
     c = [samples.c_n, samples.c_t[:, list(formation.rolling_rows)]]
     values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
-    values[:, limits.of(PRESS)] -= margin
-    slack = limits.find_slack(values) / limits.side_scales
-    bent = np.flatnonzero(np.delete(limits.rows, [-4, -3], axis=1).any(axis=1))
-    slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
+    rows, signs, _ = limits.sides
     relieved = np.repeat(find_relieved(stage, limits), SETTINGS.checks, axis=0)
+    bare = signs * values[:, rows]
+    values[:, limits.of(PRESS)] -= margin
+    slack = np.where(relieved, bare, limits.find_slack(values)) / limits.side_scales
+    bent = np.flatnonzero(np.delete(limits.rows, [-4, -3], axis=1).any(axis=1))
+    slack[:, ~np.isin(rows, bent)] = 0.0
     # Misses at the start of a stage do not depend on it.
     gaps, watched = np.ones_like(check.limits), list(stage.monitored)
     gaps[:, watched] = check.limits[:, watched] - np.minimum(check.limits[:1, watched], 0.0)
@@ -619,7 +621,7 @@ def find_misses(
     senses = stage.measure_senses(samples.z, samples.z_dot)
     senses -= 0.5 * least_senses(stage, check.places)
     senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
-    tables = (slack - deviations + 1e3 * relieved, gaps, senses)  # does not count
+    tables = (slack - deviations, gaps, senses)
     return LimitMisses(*(np.maximum(-find_minima(_by_interval(table)), 0.0) for table in tables))
 
 

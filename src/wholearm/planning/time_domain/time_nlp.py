@@ -596,7 +596,7 @@ def hold_ends(
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> Flags:
-    """Sides without effect in each interval, as forces vanish or set in or slip, (K, n_sides)."""
+    """Sides with bound zero in each interval, as forces vanish or set in or slip, (K, n_sides)."""
     relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
     if stage.formation.scene.has_slow_motors:
         for contact, slips in stage.fading:
@@ -701,9 +701,9 @@ def find_bounds(
             else:
                 high[speeds] = -one_way
         sides, signs, values = rows.limits.sides
-        least = signs * values + raised.held * rows.limits.scales[sides]
         # Forces that vanish or set in are only nonnegative.
-        least[find_relieved(stage, rows.limits)] = 0.0
+        least = np.where(find_relieved(stage, rows.limits), 0.0, signs * values)
+        least += raised.held * rows.limits.scales[sides]
         for side, on_rows, indices in rows.parts:
             floor = least[:, side, None]
             if on_rows:
