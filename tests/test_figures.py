@@ -39,8 +39,13 @@ from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_each
 from wholearm.figures.map_figure import draw_map
-from wholearm.figures.plots import draw_torques, scale_margins
-from wholearm.figures.snapshots import choose_snapshots, draw_snapshot, measure_box
+from wholearm.figures.plots import (
+    choose_snapshots,
+    draw_snapshot,
+    draw_torques,
+    measure_box,
+    scale_margins,
+)
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
@@ -49,8 +54,9 @@ from wholearm.planning.nlp import Solver
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
+from wholearm.verification.newton_euler import locate
 from wholearm.viewer.movie import FRAMES, write_movie
-from wholearm.viewer.page import Pushes, build_page, describe_motion, write_chart, write_player
+from wholearm.viewer.page import build_page, describe_motion, write_chart, write_player
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 
@@ -443,7 +449,12 @@ def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
 
 def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     problem, plan = problem_of(LANDING), plan_of(LANDING)
-    points, normals, _, forces, _ = Pushes.of(problem.scene, plan)
+    touches = [locate(problem.scene, name, plan.z) for name in plan.contacts]
+    points, normals, tangents = (
+        np.stack([getattr(touch, name)[:, :2] for touch in touches], axis=1)
+        for name in ("point", "normal", "tangent")
+    )
+    forces = plan.c_n[..., None] * normals + plan.c_t[..., None] * tangents
     mass, inertia = problem.scene.mass_diagonal[1:3]
     arms = points - plan.q[:, None, :2]
     moments = arms[..., 0] * forces[..., 1] - arms[..., 1] * forces[..., 0]

@@ -30,35 +30,18 @@ from ..problem.read import build_problem
 from ..problem.table import write_toml
 
 Random = np.random.Generator
+_LINK = {"length": 0.11, "radius": 0.005, "inertia": 0.005, "viscous": 0.01, "dry": 0.01}
+_LINK |= {"torque_limit": 2.0, "speed_limit": 30.0}
+_CONTACTS = ("v0-palm", "v1-palm", "v2-finger1", "v3-finger2")
+_CORNERS = ((-0.035, -0.035), (0.035, -0.035), (0.035, 0.035), (-0.035, 0.035))
 BASE: dict[str, Any] = {
-    "name": "square",
-    "epsilon": 0.05,
-    "gravity": 9.81,
-    "fingers_collide": True,
-    "object": {
-        "vertices": [[-0.035, -0.035], [0.035, -0.035], [0.035, 0.035], [-0.035, 0.035]],
-        "mass": 0.2,
-    },
-    "fingers": {
-        key: {
-            "base": [side * 0.08, -0.01],
-            "length": 0.11,
-            "radius": 0.005,
-            "inertia": 0.005,
-            "viscous": 0.01,
-            "dry": 0.01,
-            "torque_limit": 2.0,
-            "speed_limit": 30.0,
-        }
-        for key, side in (("1", 1.0), ("2", -1.0))
-    },
+    "name": "square", "epsilon": 0.05, "gravity": 9.81, "fingers_collide": True,
+    "object": {"vertices": [*map(list, _CORNERS)], "mass": 0.2},
+    "fingers": {"1": {"base": [0.08, -0.01], **_LINK}, "2": {"base": [-0.08, -0.01], **_LINK}},
     "friction": {"palm": 0.1, "finger1": 0.1, "finger2": 0.1},
     "start": {"flush": 0, "x": 0.02},
-    "phases": [
-        {"contacts": ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"], "until": {"x": x}}
-        for x in (0.005, -0.01)
-    ],
-}
+    "phases": [{"contacts": [*_CONTACTS], "until": {"x": x}} for x in (0.005, -0.01)],
+}  # fmt: skip
 """A problem that is planned quickly: a square that slides to the left in two phases."""
 STRANGE: tuple[Any, ...] = (
     float("nan"), float("inf"), float("-inf"), 0, -0.0, -1, 2**63, 10**400, 1e308, 5e-324, 1e-30,
