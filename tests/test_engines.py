@@ -17,7 +17,7 @@ from wholearm import InputError, Plan, Problem, find_route, make_policy, verify,
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.engines import engine_replay
-from wholearm.engines.interface import (
+from wholearm.engines.engine_replay import (
     EngineRun,
     Setting,
     find_between,

@@ -45,9 +45,9 @@ from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
 from ..simulation.stepper import NODES
-from .damage import BASE, STRANGE, change_tree, damage_torques
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
+from .stress import BASE, STRANGE, change_tree, damage_torques
 from .study import Case, Findings, Row, Study, digest_source, name_case
 
 FOUR = "heptagon_four_contacts"

@@ -829,8 +829,7 @@ def _export(options: argparse.Namespace) -> int:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from ..engines.engine_replay import ALLOWED, require_engine
-    from ..engines.interface import Setting
+    from ..engines.engine_replay import ALLOWED, Setting, require_engine
 
     require_engine(options.engine)
     problem, plan, policy = _load_replayed(options)

@@ -20,7 +20,7 @@ from pydrake.systems.primitives import TrajectorySource
 from ..common.arrays import Array
 from ..problem.definition import Problem
 from ..scene.model import Scene
-from . import interface as engine
+from . import engine_replay as engine
 
 _EVERY = 4  # steps from one look at the forces to the next: contacts swing ten times as slowly
 
