@@ -31,8 +31,7 @@ from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
 from wholearm.common.document import Document, Table
-from wholearm.common.journal import Journal
-from wholearm.common.parallel import Processes, run_all
+from wholearm.common.parallel import Journal, Processes, run_all
 from wholearm.planning.nlp import record_runs
 from wholearm.problem.read import build_problem, read_problem
 

@@ -27,8 +27,7 @@ from typing import IO, TYPE_CHECKING, Any
 from .. import __version__
 from ..common.document import Document, Table, format_csv
 from ..common.files import make_folder, together, write_text
-from ..common.journal import Journal
-from ..common.parallel import Processes, run_all
+from ..common.parallel import Journal, Processes, run_all
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
