@@ -514,7 +514,9 @@ def _solve(options: argparse.Namespace) -> int:
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
-    make_table = _choose_table(options)
+    require_with(options, "sample_rate", "interpolation")
+    require_with(options, "torques", "sample_rate")
+    choice("linear", "hold").read(options.interpolation or "linear", "interpolation")
     problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
@@ -528,7 +530,7 @@ def _solve(options: argparse.Namespace) -> int:
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress, options.time_limit)
-        table = None if make_table is None else make_table(plan)
+        table = None if options.torques is None else _make_table(options, plan)
     except WholearmError as error:
         # Of bad input one line says everything.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
@@ -549,20 +551,15 @@ def _solve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _choose_table(options: argparse.Namespace) -> Callable[[wholearm.Plan], TorqueTable] | None:
-    """What makes the torque table of a plan, checked before anything is planned; None for none."""
-    require_with(options, "sample_rate", "interpolation")
-    require_with(options, "torques", "sample_rate")
-    if options.torques is None:
-        return None
-    rate, interpolation = options.sample_rate, options.interpolation or "linear"
+def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
+    """The torque table of a plan."""
     from ..planning import replay_check
-    from ..results.torque import require_sampling
 
-    if rate is None:
-        return lambda plan: replay_check.make_table(plan.problem, plan.trajectory, options.replay)
-    sampling = require_sampling(rate, interpolation), interpolation, options.replay
-    return lambda plan: replay_check.sample_table(plan.problem, plan.trajectory, *sampling)
+    given = plan.problem, plan.trajectory
+    if options.sample_rate is None:
+        return replay_check.make_table(*given, options.replay)
+    sampling = options.sample_rate, options.interpolation or "linear"
+    return replay_check.sample_table(*given, *sampling, options.replay)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -700,13 +697,10 @@ def _robustness(options: argparse.Namespace) -> int:
     study = wholearm.assess_robustness(
         problem,
         plan,
-        samples=options.samples,
-        seed=options.seed,
+        **list_given(options, "samples", "seed", "phase", "fresh"),
         uncertainty=trials,
-        phase=options.phase,
         policy=policy,
         path=output,
-        fresh=options.fresh,
         start=choose_workers(options),
         progress=show_progress,
     )

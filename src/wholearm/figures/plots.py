@@ -38,6 +38,7 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from ..verification.newton_euler import locate, place_object
 from . import style
+from .style import Styles
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -50,7 +51,7 @@ SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, 
 
 
 def draw_snapshot(
-    axes: Axes, scene: Scene, z: Array, contacts: Sequence[str], styles: style.Styles, box: Array
+    axes: Axes, scene: Scene, z: Array, contacts: Sequence[str], styles: Styles, box: Array
 ) -> list[Artist]:
     """Draw palm, links, object with numbered vertices, and contacts, on axes in m without a frame.
 
@@ -216,12 +217,7 @@ def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool
 
 
 def draw_strip(
-    figure: Figure,
-    top: float,
-    strip: Strip,
-    trajectory: Trajectory,
-    scene: Scene,
-    styles: style.Styles,
+    figure: Figure, top: float, strip: Strip, trajectory: Trajectory, scene: Scene, styles: Styles
 ) -> None:
     """Draw the snapshots of a strip whose upper end is at `top` [in], with times and phases."""
     room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
@@ -265,7 +261,7 @@ def measure_box(scene: Scene, z: Array) -> Array:
 
 
 def draw_margins(
-    axes: Axes, trajectory: Trajectory, epsilon: float, styles: style.Styles, more: ArrayLike = ()
+    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, more: ArrayLike = ()
 ) -> None:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
@@ -328,11 +324,7 @@ def _scale_ticks(axes: Axes, factor: float) -> None:
 
 
 def draw_cones(
-    axes: Axes,
-    trajectory: Trajectory,
-    scene: Scene,
-    styles: style.Styles,
-    simulation: Simulation | None = None,
+    axes: Axes, trajectory: Trajectory, scene: Scene, styles: Styles, simulation: Simulation | None
 ) -> None:
     """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip."""
     fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]

@@ -69,8 +69,8 @@ def describe_motion(
         spans = [
             {
                 "first": run.start,
-                "point": _fix(touch.point[run], scene),
-                "normal": _fix(touch.normal[run, :2], scene),
+                "point": fix(touch.point[run], scene),
+                "normal": fix(touch.normal[run, :2], scene),
                 "c": _round(c[run]),
             }
             for run in find_runs(np.isfinite(c).all(axis=1), least=2)
@@ -81,11 +81,11 @@ def describe_motion(
     behind = None
     if ghost is not None:
         few = _choose_rows(ghost, every[:0], most)
-        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few], scene)}
+        behind = {"t": _round(ghost.t[few]), "z": fix(ghost.z[few], scene)}
     return describe_hand(scene) | {
         "epsilon": problem.epsilon,
         "t": _round(trajectory.t[rows]),
-        "z": _fix(trajectory.z[rows], scene),
+        "z": fix(trajectory.z[rows], scene),
         "tau": _round(trajectory.tau[rows]),
         "phase": trajectory.phase[rows].tolist(),
         "starts": _round(trajectory.phase_starts),
@@ -120,14 +120,12 @@ def describe_hand(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _fix(values: Array, scene: Scene) -> Any:
-    """Nested lists of places, directions or angles [m, rad]."""
-    return np.round(values, count_places(scene)).tolist()
+def fix(values: Array, scene: Scene) -> Any:
+    """Nested lists of places, directions or angles [m, rad].
 
-
-def count_places(scene: Scene) -> int:
-    """Decimals of places and angles in a page: 5 for an object of a centimetre or more."""
-    return max(5, 3 - math.floor(math.log10(scene.scales.length)))
+    They have 5 decimals for an object of a centimetre or more.
+    """
+    return np.round(values, max(5, 3 - math.floor(math.log10(scene.scales.length)))).tolist()
 
 
 def _round(values: Array) -> Any:
