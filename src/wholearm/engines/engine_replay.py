@@ -90,12 +90,9 @@ def list_shapes(scene: Scene) -> list[Shape]:
     InputError if a link has no thickness: what sinks into it would come out on the other side.
     """
     r, corners = find_rounding(scene), scene.polygon.vertices
-    after = np.roll(corners, -1, axis=0)
+    edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
     shapes = [Shape(f"v{i}", OBJECT, corner[None], r) for i, corner in enumerate(corners)]
-    shapes += [
-        Shape(f"e{j}", OBJECT, np.array(ends), r)
-        for j, ends in enumerate(zip(corners, after, strict=True))
-    ]
+    shapes += [Shape(f"e{j}", OBJECT, ends, r) for j, ends in enumerate(edges)]
     for number, (link, body) in enumerate(zip(scene.fingers, LINKS, strict=True), 1):
         if link.radius == 0:
             text = "0 given; engines need links of some thickness, 1e-4 of the length or more"
@@ -113,8 +110,8 @@ def list_pairs(scene: Scene) -> list[Pair]:
     pairs = [Pair(f"v{i}", PALM, scene.friction.palm) for i in count]
     for number, friction in enumerate((scene.friction.finger1, scene.friction.finger2), 1):
         pairs += [Pair(f"v{i}", f"finger{number}", friction) for i in count]
-        pairs += [Pair(f"e{j}", f"tip{number}", friction) for j in count]
-        pairs += [Pair(f"e{j}", f"joint{number}", friction) for j in count]
+        circles = f"tip{number}", f"joint{number}"
+        pairs += [Pair(f"e{j}", circle, friction) for circle in circles for j in count]
     if scene.fingers_collide:
         pairs.append(Pair("finger1", "finger2", 0.0))
     return pairs
