@@ -524,14 +524,9 @@ together."""
 
 
 TOLERANCES = {
-    "value": 1e-6,
-    "amount": 1e-2,
-    "advice": 5e-2,
-    "numbers": 1e-3,
-    "least": 1e-3,
-    "margins": 1e-3,
+    "value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "least": 1e-3, "margins": 1e-3,
     "stops": 2e-3,
-}
+}  # fmt: skip
 """Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
 
 An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
