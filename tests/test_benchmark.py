@@ -8,7 +8,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,11 @@ from wholearm.benchmark.corpus import answer, compare, count, list_cases
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.growth import WORK, run_work
 from wholearm.benchmark.skip import STUDY as SKIP
-from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
+from wholearm.benchmark.skip import list_pairs
 from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
 from wholearm.common.document import Document, Table
-from wholearm.common.journal import Journal
-from wholearm.common.parallel import Processes, run_all
+from wholearm.common.parallel import Journal, Processes, run_all
 from wholearm.planning.nlp import record_runs
 from wholearm.problem.read import build_problem, read_problem
 
@@ -226,7 +225,7 @@ ABSENT = ("friction of joints", "speed limits that never bind")
 """Parts that are coefficients and bounds, where they are."""
 
 
-Pairs = dict[str, tuple[SkipPlan, SkipPlan]]
+Pairs = dict[str, tuple[partial[Row], partial[Row]]]
 
 
 @pytest.fixture(scope="module")
@@ -250,14 +249,12 @@ def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
 def test_friction_and_limits_are_free_along_curves(pairs: Pairs, part: str) -> None:
     pair = pairs[f"{part}, along curves"]
     for case in pair:
-        assert_bare(spend(case), TOUCHING, 0)
+        assert_bare(case(), TOUCHING, 0)
 
 
 def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: Pairs) -> None:
     own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
-    full, smooth, free, limited = (
-        spend(case) for case in (own[0][1], own[0][0], own[1][0], own[2][1])
-    )
+    full, smooth, free, limited = (case() for case in (own[0][1], own[0][0], own[1][0], own[2][1]))
     # What else there is, are coefficients and bounds.
     assert {own["unknowns"] for own in (full, free, limited)} == {smooth["unknowns"]}
     assert {own["rows"] for own in (full, free, limited)} == {full["rows"]}
@@ -268,15 +265,15 @@ def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: Pairs
 
 def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(pairs: Pairs) -> None:
     tip = pairs["a second freedom"][0]
-    (phase,) = tip.problem.phases
+    (phase,) = tip.args[0].phases
     assert (phase.formation.n_contacts, phase.formation.n_rolling) == (3, 1)
-    assert_bare(spend(tip), 3, 1)
+    assert_bare(tip(), 3, 1)
 
 
 def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
     pair = pairs["a figure"]
     rows = [
-        {"case": ["anywhere", "a figure", having, 0], **spend(plan)}
+        {"case": ["anywhere", "a figure", having, 0], **plan()}
         for having, plan in zip((False, True), pair, strict=True)
     ]
     *_, table = SKIP.report(rows, argparse.Namespace())[0]

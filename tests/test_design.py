@@ -13,7 +13,7 @@ import wholearm
 from wholearm import InfeasibleError, InputError, PlanOptions, Problem, find_sensitivities
 from wholearm.cli.command import main
 from wholearm.design.hand import Design, Hand, design_hand, read_choices
-from wholearm.design.parameters import find_parameter, list_parameters, require_allowed
+from wholearm.design.sweep import find_parameter, list_parameters, require_allowed
 
 UNITS = {
     "": (0, 0, 0), "kg": (0, 1, 0), "m": (1, 0, 0), "N": (1, 1, -2), "N m": (2, 1, -2),

@@ -17,14 +17,7 @@ from wholearm import InputError, Plan, Problem, find_route, make_policy, verify,
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.engines import engine_replay
-from wholearm.engines.interface import (
-    EngineRun,
-    Setting,
-    find_between,
-    list_pairs,
-    list_steps,
-    list_stretches,
-)
+from wholearm.engines.engine_replay import EngineRun, list_pairs, list_steps, list_stretches
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases
@@ -166,7 +159,7 @@ def test_export_writes_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 EXTRAS = {"mujoco": "mujoco", "drake": "pydrake"}
-COARSE = Setting(6.4e-4)
+COARSE = engine_replay.Setting(6.4e-4)
 
 
 @cache
@@ -371,10 +364,10 @@ def test_a_plan_is_known_between_the_rows_of_its_file(tmp_path: Path) -> None:
     plan = plan_of(HEPTAGON)
     plan.save(tmp_path / "plan.npz")
     loaded = load_trajectory(tmp_path / "plan.npz")
-    found, t = find_between(loaded), np.linspace(0.0, plan.duration - 1e-9, 2001)
+    found, t = engine_replay.find_between(loaded), np.linspace(0.0, plan.duration - 1e-9, 2001)
     off = [np.nanmean(np.abs(own.at(t).c_n - plan.at(t).c_n)) for own in (found, loaded)]
     assert off[0] < 0.1 * off[1]
     # What does not replay as planned is taken as it is.
     weaker = replace(loaded.torque, coefficients=0.9 * loaded.torque.coefficients)
     wrong = replace(loaded, torque=weaker)
-    assert find_between(wrong) is wrong
+    assert engine_replay.find_between(wrong) is wrong

@@ -39,8 +39,6 @@ from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_each
 from wholearm.figures.map_figure import draw_map
-from wholearm.figures.plots import draw_torques, scale_margins
-from wholearm.figures.snapshots import choose_snapshots, draw_snapshot, measure_box
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
@@ -49,8 +47,9 @@ from wholearm.planning.nlp import Solver
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
+from wholearm.verification.newton_euler import locate
 from wholearm.viewer.movie import FRAMES, write_movie
-from wholearm.viewer.page import Pushes, build_page, describe_motion, write_chart, write_player
+from wholearm.viewer.page import build_page, describe_motion, write_chart, write_player
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 
@@ -149,7 +148,7 @@ def test_figure_has_a_strip_of_one_scale_and_two_panels_with_units(figure: Figur
 )
 def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))
-    draw_torques(axes, torque, np.array([size, size]))
+    plots.draw_torques(axes, torque, np.array([size, size]))
     axes.figure.canvas.draw()
     assert f"[{prefix}N m]" in axes.get_ylabel()
     labels = [tick.get_text() for tick in axes.get_yticklabels()]
@@ -159,7 +158,7 @@ def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
 @pytest.mark.parametrize("height", [0.4, 1.0])
 def test_ticks_of_margins_are_apart_in_low_panels(height: float) -> None:
     axes = Figure((4.0, 4.0)).add_axes((0.2, 0.0, 0.8, height))
-    scale_margins(axes, np.array([-5.0, 300.0]), 5.0)
+    plots.scale_margins(axes, np.array([-5.0, 300.0]), 5.0)
     places = axes.transData.transform([[0.0, tick] for tick in axes.get_yticks()])[:, 1]
     assert np.diff(places).min() >= 8.0 / 72 * axes.figure.dpi
     assert {0.0, 1.0, 100.0} <= set(axes.get_yticks())
@@ -195,7 +194,7 @@ def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
         np.array([0.0, 0.5, 2.0]),
         np.array([[[0.25, 0.25, 0.0], [1.0, 0.0, 0.0]], [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.0]]]),
     )
-    draw_torques(axes, profile, np.array([2.0, 2.0]))
+    plots.draw_torques(axes, profile, np.array([2.0, 2.0]))
     line, other = axes.lines[:2]
     t, tau = data_of(line)
     np.testing.assert_allclose(tau[t == 0.5], [0.5, -0.5])
@@ -210,7 +209,8 @@ def test_snapshot_is_to_scale(
 ) -> None:
     z, names = trajectory.z[row], trajectory.motions[trajectory.phase[row]].contacts
     scene, styles = heptagon.scene, choose_styles(trajectory.contacts)
-    _, *links, body = draw_snapshot(axes, scene, z, names, styles, measure_box(scene, z[None]))[:4]
+    box = plots.measure_box(scene, z[None])
+    _, *links, body = plots.draw_snapshot(axes, scene, z, names, styles, box)[:4]
     corners = place_corners(scene, z)
     assert isinstance(body, Polygon)
     np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-13)
@@ -232,7 +232,7 @@ def test_snapshot_is_to_scale(
 def test_snapshots_are_at_least_six_and_one_of_every_phase(trajectory: Trajectory) -> None:
     for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
         other = repeat(trajectory, phases)
-        rows = choose_snapshots(other)
+        rows = plots.choose_snapshots(other)
         assert len(rows) == max(6, len(phases) + 1)
         assert rows[0] == 0 and rows[-1] == len(other.t) - 1
         assert (np.diff(rows) > 0).all()
@@ -443,7 +443,10 @@ def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
 
 def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     problem, plan = problem_of(LANDING), plan_of(LANDING)
-    points, normals, _, forces, _ = Pushes.of(problem.scene, plan)
+    touches = [locate(problem.scene, name, plan.z) for name in plan.contacts]
+    points = np.stack([touch.point for touch in touches], axis=1)
+    rows = np.stack([(touch.normal, touch.tangent) for touch in touches], axis=2)[..., :2]
+    forces = plan.c_n[..., None] * rows[0] + plan.c_t[..., None] * rows[1]
     mass, inertia = problem.scene.mass_diagonal[1:3]
     arms = points - plan.q[:, None, :2]
     moments = arms[..., 0] * forces[..., 1] - arms[..., 1] * forces[..., 0]
@@ -453,7 +456,7 @@ def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
     scale = np.nanmax(np.abs(forces))
     np.testing.assert_allclose(mass * plan.q_ddot[:, :2], force, atol=1e-5 * scale)
     np.testing.assert_allclose(inertia * plan.q_ddot[:, 2], moment, atol=1e-6 * scale)
-    np.testing.assert_allclose(np.hypot(*normals.T), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.hypot(*rows[0].T), 1.0, rtol=1e-12)
 
 
 def test_a_motion_survives_its_page() -> None:

@@ -14,9 +14,8 @@ from shipped import HEPTAGON, tipping
 from toys import plan_path
 from wholearm import Friction, Phase, PlanOptions, Problem, Trajectory, load
 from wholearm.benchmark import refusals
-from wholearm.benchmark.damage import look, run_file
 from wholearm.benchmark.scenes import draw_case, random_scene
-from wholearm.benchmark.stress import compare_values
+from wholearm.benchmark.stress import compare_values, look, run_file
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve

@@ -23,8 +23,7 @@ from ..common.arrays import Array, interpolate
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.fields import Field, Range
-from ..common.journal import Journal
-from ..common.parallel import DiedError, Processes, run_all
+from ..common.parallel import DiedError, Journal, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import PARAMETERS, Phase, Problem, change_scene, read_widths

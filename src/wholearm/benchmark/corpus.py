@@ -3,9 +3,6 @@
 A case names a family and what that is asked with; families call the public functions alone. Two
 answers agree if kinds, verdicts and contact modes are the same and numbers are within `TOLERANCES`.
 A better value of the objective is no difference, whatever else it changes.
-
-Numbers may be rounded differently: OpenBLAS has kernels for each processor, of which
-``OPENBLAS_CORETYPE`` chooses one, and `perturb_scenes` changes numbers in the last bits.
 """
 
 from __future__ import annotations
@@ -45,9 +42,9 @@ from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
 from ..simulation.stepper import NODES
-from .damage import BASE, STRANGE, change_tree, damage_torques
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
+from .stress import BASE, OBJECTIVES, STRANGE, change_tree, damage_torques
 from .study import Case, Findings, Row, Study, digest_source, name_case
 
 FOUR = "heptagon_four_contacts"
@@ -55,7 +52,6 @@ PROBLEMS = (
     "box_rolling", "heptagon", FOUR, "heptagon_impact", "heptagon_twice", "hexagon", "square",
     "triangle",
 )  # fmt: skip
-OBJECTIVES = ("time", "effort", "margin")
 RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4, "geometry": 0.0}
 """Half widths of uncertain numbers."""
 VARIANTS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
@@ -528,14 +524,9 @@ together."""
 
 
 TOLERANCES = {
-    "value": 1e-6,
-    "amount": 1e-2,
-    "advice": 5e-2,
-    "numbers": 1e-3,
-    "least": 1e-3,
-    "margins": 1e-3,
+    "value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "least": 1e-3, "margins": 1e-3,
     "stops": 2e-3,
-}
+}  # fmt: skip
 """Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
 
 An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
@@ -600,14 +591,13 @@ class Corpus(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """How many answers of each family are the same, and which differ; or they are stored."""
-        answers = {name_case(row): row["answer"] for row in rows}
+        new = options.update and not Path(options.answers).exists()
+        stored = {} if new else read_json(options.answers)
         if options.update:
-            contents = read_json(options.answers) if Path(options.answers).exists() else {}
-            contents |= answers
-            names = sorted({" ".join(map(str, case)) for case in list_cases()} & contents.keys())
-            lines = [f"{json.dumps(name)}: {json.dumps(contents[name])}" for name in names]
+            stored |= {name_case(row): row["answer"] for row in rows}
+            names = sorted({" ".join(map(str, case)) for case in list_cases()} & stored.keys())
+            lines = [f"{json.dumps(name)}: {json.dumps(stored[name])}" for name in names]
             write_text(options.answers, "{\n" + ",\n".join(lines) + "\n}\n")
-        stored = read_json(options.answers)
         verdicts = {}
         for row in rows:
             pair = row["answer"], stored.get(name_case(row))

@@ -5,10 +5,7 @@ object, drawn at random for the shipped scenes and for random polygons in the he
 query is asked twice: first of a scene that nothing is known of, then for a goal a little further
 on, with what is known. `draw_leg` draws routes that need no search.
 
-With ``--ways`` the phases that `route` prints take the place of the goal. They are planned as they
-are, over time, with limited rates, control periods and dwell, and a policy of the plan is simulated
-without given contacts. Counted is what has a plan, how far its objective is from that of the route,
-and the processor time over that of planning the printed phases.
+With ``--ways`` the phases that `route` prints take the place of the goal (see README.md).
 """
 
 from __future__ import annotations

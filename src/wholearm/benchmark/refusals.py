@@ -394,13 +394,13 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
     refusal of several is confirmed by that of any, and refuted by a motion of all.
     """
     match = re.search(r"phases?[ \[](\d+)(?: and (\d+)| to (\d+))?", str(error))
-    number = int(match[1]) if match else None
+    number = int(match[1]) if match else 1
     last = int(match[2] or match[3] or match[1]) if match else len(problem.phases)
     z = problem.start
     open_end = Verdict("open", "")
     planned = False
     for phase in problem.phases:
-        concerned = (number or 1) <= phase.number <= last
+        concerned = number <= phase.number <= last
         if planned and not concerned:
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
@@ -422,7 +422,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
             continue
         if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
-        before = None if concerned or number is None else _find_start(problem, number)
+        before = None if concerned else _find_start(problem, number)
         if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
         z, planned = before, True

@@ -26,12 +26,16 @@ from ..mapping.formation_list import Stretch, format_route, list_formations, tol
 from ..problem.definition import Problem
 from ..problem.read import build_problem
 from ..verification.newton_euler import locate
-from .damage import Random, pick
 from .refusals import slow_margin
 
+Random = np.random.Generator
 Table = dict[str, Any]
-
 PLACES = 60  # places along a border at which a route looks for its ends
+
+
+def pick(rng: Random, options: Sequence[Any]) -> Any:
+    """One of some options."""
+    return options[int(rng.integers(len(options)))]
 
 
 def random_scene(rng: Random) -> Table:

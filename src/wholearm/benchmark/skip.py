@@ -9,10 +9,11 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Skip(Study):
     def run(self, case: Case) -> Row:
         """Plan once."""
         folder, part, having, _ = case
-        return spend(list_pairs(folder)[part][having])
+        return list_pairs(folder)[part][having]()
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Sizes, and medians of times."""
@@ -65,18 +66,11 @@ class Skip(Study):
 STUDY = Skip()
 
 
-class SkipPlan(NamedTuple):
-    """A problem to plan, and how."""
+def list_pairs(folder: str, **options: Any) -> dict[str, tuple[partial[Row], partial[Row]]]:
+    """What the same phases cost without each part of the model and with it, by the part's name.
 
-    problem: Problem
-    options: dict[str, Any]  # of `solve`
-    draw: bool = False  # whether the plan is drawn as well
-
-
-def list_pairs(folder: str, **options: Any) -> dict[str, tuple[SkipPlan, SkipPlan]]:
-    """The same phases without each part of the model and with it, by what the part is called.
-
-    Problems are made of those in a folder; `options` are those of `solve`.
+    Each is to be measured by `spend`. Problems are made of those in a folder; `options` are those
+    of `solve`.
     """
     whole, box, joined = (
         load(str(Path(folder) / f"{name}.toml"))
@@ -85,11 +79,8 @@ def list_pairs(folder: str, **options: Any) -> dict[str, tuple[SkipPlan, SkipPla
     slide = build_problem({**whole.table, "phases": whole.table["phases"][:1]}, whole.source)
     tip = _pick(box, 1, 2)
     path, over_time = options, options | {"transcription": "time"}
-    pairs = {
-        f"{part}, {where}": (
-            SkipPlan(slide.with_(absent), settings),
-            SkipPlan(slide.with_(present), settings),
-        )
+    problems = {
+        f"{part}, {where}": (slide.with_(absent), slide.with_(present), settings)
         for where, settings in (("along curves", path), ("over time", over_time))
         for part, absent, present in (
             ("friction of contacts", {"friction": 0.0}, {}),
@@ -108,12 +99,16 @@ def list_pairs(folder: str, **options: Any) -> dict[str, tuple[SkipPlan, SkipPla
     idle = replace(both, start=both.start + np.array([0, 0, 0, 0, 0.6]), phases=(alone,))
     run = _pick(joined, 0, 2)
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
-    return pairs | {
-        "a rolling contact, over time": (SkipPlan(slipping, over_time), SkipPlan(tip, over_time)),
-        "a second freedom": (SkipPlan(tip, path), SkipPlan(slipping, path)),
-        "a transition at speed": (SkipPlan(stop, path), SkipPlan(run, path)),
-        "an idle finger, over time": (SkipPlan(both, over_time), SkipPlan(idle, over_time)),
-        "a figure": (SkipPlan(slide, path), SkipPlan(slide, path, draw=True)),
+    problems |= {
+        "a rolling contact, over time": (slipping, tip, over_time),
+        "a second freedom": (tip, slipping, path),
+        "a transition at speed": (stop, run, path),
+        "an idle finger, over time": (both, idle, over_time),
+        "a figure": (slide, slide, path),
+    }
+    return {
+        part: (partial(spend, one, settings), partial(spend, other, settings, part == "a figure"))
+        for part, (one, other, settings) in problems.items()
     }
 
 
@@ -125,16 +120,19 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
     return replace(problem, start=start, phases=tuple(phases))
 
 
-def spend(plan: SkipPlan) -> Row:
-    """Sizes of the first NLP of a plan, and processor time outside and inside the solver [s]."""
-    problem, started = plan.problem, time.process_time()
+def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
+    """Sizes of the first NLP of a plan, and processor time outside and inside the solver [s].
+
+    It is that of planning, with options of `solve`, and of drawing the plan if that is asked for.
+    """
+    started = time.process_time()
     with record_runs() as runs:
-        if plan.options.get("transcription") == "time":
+        if options.get("transcription") == "time":
             # Not from the plan along curves, whose NLPs are others.
-            plan_phases(problem, problem.phases, problem.start, PlanOptions(**plan.options))
+            plan_phases(problem, problem.phases, problem.start, PlanOptions(**options))
         else:
-            solution = solve(problem, replay=False, **plan.options)
-    if plan.draw:
+            solution = solve(problem, replay=False, **options)
+    if draw:
         from ..figures.plots import force_margins
 
         force_margins(solution).canvas.draw()

@@ -19,16 +19,15 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..common.document import Document, Table, format_csv
 from ..common.files import make_folder, together, write_text
-from ..common.journal import Journal
-from ..common.parallel import Processes, run_all
+from ..common.parallel import Journal, Processes, run_all
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -176,38 +175,30 @@ def digest_source(inputs: Iterable[Path] = ()) -> str:
 
 def measure_case(study: Study, case: Case) -> Row:
     """Run a case in a process of a study, with what that took."""
-    printed = _redirect()
-    peak, started, wall_start = find_peak(), time.process_time(), time.monotonic()
-    try:
-        with warnings.catch_warnings():
-            if study.strict:
-                warnings.simplefilter("error")
-            row = dict(study.run(case))
-    except Exception:
-        text = traceback.format_exc().strip()[-1500:]
-        row = _fail(f"traceback after {time.monotonic() - wall_start:.0f} s: {text}")
-    seconds, memory = time.process_time() - started, find_peak() - peak
-    sys.stdout.flush()
-    sys.stderr.flush()
-    printed.seek(0)
-    if text := printed.read().decode(errors="replace").strip():
-        row["printed"] = text[:500]
-    printed.seek(0)
-    printed.truncate()
+    with tempfile.TemporaryFile() as printed:
+        # Libraries print there, too.
+        for stream in (1, 2):
+            os.dup2(printed.fileno(), stream)
+        peak, started, wall_start = find_peak(), time.process_time(), time.monotonic()
+        try:
+            with warnings.catch_warnings():
+                if study.strict:
+                    warnings.simplefilter("error")
+                row = dict(study.run(case))
+        except Exception:
+            text = traceback.format_exc().strip()[-1500:]
+            row = _fail(f"traceback after {time.monotonic() - wall_start:.0f} s: {text}")
+        seconds, memory = time.process_time() - started, find_peak() - peak
+        sys.stdout.flush()
+        sys.stderr.flush()
+        printed.seek(0)
+        if text := printed.read().decode(errors="replace").strip():
+            row["printed"] = text[:500]
     return row | {"seconds": round(seconds, 4), "memory": round(memory, 2)}
 
 
 def _fail(text: str) -> Row:
     return {"failed": text, "findings": [text]}
-
-
-@cache
-def _redirect() -> IO[bytes]:
-    """A file that this process writes to instead of stdout and stderr, libraries included."""
-    printed = tempfile.TemporaryFile()
-    for stream in (1, 2):
-        os.dup2(printed.fileno(), stream)
-    return printed
 
 
 def find_peak() -> float:

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module, resources
@@ -425,17 +425,12 @@ def require_output(path: str | None, *endings: str) -> None:
         require_ending(path, *(endings or (".png", ".pdf", ".svg")))
 
 
-def finish(
-    options: argparse.Namespace,
-    result: Result | None,
-    *paths: str | None,
-    notes: Mapping[str, Any] | None = None,
-) -> int:
+def finish(options: argparse.Namespace, result: Result | None, *paths: str | None) -> int:
     """Print a result as text or JSON with notes, and files that are written; the exit status."""
     clear_progress()
     as_json = getattr(options, "json", False)
     if result is not None and as_json:
-        print(json.dumps({**result.to_dict(), **(notes or {})}, indent=2))
+        print(json.dumps(result.to_dict() | getattr(options, "notes", {}), indent=2))
     elif result is not None:
         print(result.to_text())
     written = ", ".join(filter(None, paths))
@@ -482,16 +477,14 @@ def read_problem(options: argparse.Namespace) -> wholearm.Problem:
     return read_problem(options.problem)
 
 
-LoadedPlan = tuple[
-    "wholearm.Problem", "wholearm.Trajectory", "wholearm.Policy | None", dict[str, list[str]]
-]
+LoadedPlan = tuple["wholearm.Problem", "wholearm.Trajectory", "wholearm.Policy | None"]
 
 
-def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> LoadedPlan:
-    """The problem with the phases of a plan, the plan, its policy if any, and notes for JSON.
+def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
+    """The problem with the phases of a plan, the plan, and its policy if any.
 
-    The `notes`, if there are any, say what was made for another problem; they are printed unless
-    `silent`. InputError, with the file, if a plan or policy makes no sense here.
+    What was made for another problem is printed, or kept where JSON or phases are. InputError, with
+    the file, if a plan or policy makes no sense here.
     """
     from ..problem.read import adopt_phases
     from ..results.adopt import describe_origin
@@ -505,9 +498,11 @@ def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> L
     for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
-    for note in () if silent else notes:
-        print(note)
-    return problem, plan, policy, {"notes": notes} if notes else {}
+    if getattr(options, "json", False) or getattr(options, "list", ()):
+        options.notes = {"notes": notes} if notes else {}
+    else:
+        print(*(f"{note}\n" for note in notes), sep="", end="")
+    return problem, plan, policy
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -519,7 +514,9 @@ def _solve(options: argparse.Namespace) -> int:
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
-    make_table = _choose_table(options)
+    require_with(options, "sample_rate", "interpolation")
+    require_with(options, "torques", "sample_rate")
+    choice("linear", "hold").read(options.interpolation or "linear", "interpolation")
     problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
@@ -533,7 +530,7 @@ def _solve(options: argparse.Namespace) -> int:
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress, options.time_limit)
-        table = None if make_table is None else make_table(plan)
+        table = None if options.torques is None else _make_table(options, plan)
     except WholearmError as error:
         # Of bad input one line says everything.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
@@ -554,20 +551,15 @@ def _solve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _choose_table(options: argparse.Namespace) -> Callable[[wholearm.Plan], TorqueTable] | None:
-    """What makes the torque table of a plan, checked before anything is planned; None for none."""
-    require_with(options, "sample_rate", "interpolation")
-    require_with(options, "torques", "sample_rate")
-    if options.torques is None:
-        return None
-    rate, interpolation = options.sample_rate, options.interpolation or "linear"
+def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
+    """The torque table of a plan."""
     from ..planning import replay_check
-    from ..results.torque import require_sampling
 
-    if rate is None:
-        return lambda plan: replay_check.make_table(plan.problem, plan.trajectory, options.replay)
-    sampling = require_sampling(rate, interpolation), interpolation, options.replay
-    return lambda plan: replay_check.sample_table(plan.problem, plan.trajectory, *sampling)
+    given = plan.problem, plan.trajectory
+    if options.sample_rate is None:
+        return replay_check.make_table(*given, options.replay)
+    sampling = options.sample_rate, options.interpolation or "linear"
+    return replay_check.sample_table(*given, *sampling, options.replay)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -579,11 +571,11 @@ def _verify(options: argparse.Namespace) -> int:
     for key, value in {"--reduced": options.reduced, "--rest-speed": options.rest_speed}.items():
         if value and options.free:
             raise InputError("", key, "does not go with --free")
-    policy, notes = None, dict[str, list[str]]()
+    policy = None
     torques: wholearm.Trajectory | wholearm.TorqueProfile
     report: wholearm.Report | wholearm.FreeReport
     if not _is_table(options.torques):
-        problem, torques, policy, notes = load_plan(options, options.torques, options.json)
+        problem, torques, policy = load_plan(options, options.torques)
     elif options.policy is not None:
         raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
     else:
@@ -602,7 +594,7 @@ def _verify(options: argparse.Namespace) -> int:
         report = wholearm.verify(problem, torques, reduced=options.reduced, **values)
     if options.output is not None:
         report.trajectory.save(options.output)
-    return finish(options, report, options.output, notes=notes)
+    return finish(options, report, options.output)
 
 
 def _is_table(path: str) -> bool:
@@ -690,7 +682,7 @@ def _robustness(options: argparse.Namespace) -> int:
     require_output(output, ".jsonl")
     require_output(options.figure)
     require_with(options, "policy", "sensor")
-    problem, plan, policy, notes = load_plan(options, options.plan, options.json)
+    problem, plan, policy = load_plan(options, options.plan)
     widths: dict[str, float] = {}
     for text in options.vary:
         name, _, value = text.partition("=")
@@ -705,18 +697,15 @@ def _robustness(options: argparse.Namespace) -> int:
     study = wholearm.assess_robustness(
         problem,
         plan,
-        samples=options.samples,
-        seed=options.seed,
+        **list_given(options, "samples", "seed", "phase", "fresh"),
         uncertainty=trials,
-        phase=options.phase,
         policy=policy,
         path=output,
-        fresh=options.fresh,
         start=choose_workers(options),
         progress=show_progress,
     )
     save_figure(options.figure, "draw_robustness", study)
-    return finish(options, study, output, options.figure, notes=notes)
+    return finish(options, study, output, options.figure)
 
 
 def _route(options: argparse.Namespace) -> int:
@@ -788,7 +777,7 @@ def _map(options: argparse.Namespace) -> int:
     require_output(output)
     problem, plan = read_problem(options), None
     if options.plan is not None:
-        problem, plan, *_ = load_plan(options, options.plan, bool(poses))
+        problem, plan, _ = load_plan(options, options.plan)
     _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
     print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
@@ -809,17 +798,17 @@ def _check_step(options: argparse.Namespace, problem: wholearm.Problem) -> None:
         step_range.check("--step", options.step, "s", problem.scene)
 
 
-def _load_replayed(options: argparse.Namespace, silent: bool) -> LoadedPlan:
+def _load_replayed(options: argparse.Namespace) -> LoadedPlan:
     """As `load_plan`, of a plan with the phases of the problem."""
     from ..results.adopt import require_same_phases
 
     if _is_table(options.plan):
         text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"
         raise InputError(options.plan, "", text)
-    problem, plan, policy, notes = load_plan(options, options.plan, silent)
+    loaded = problem, plan, _ = load_plan(options, options.plan)
     with name_source(options.plan):
         require_same_phases(problem, plan)
-    return problem, plan, policy, notes
+    return loaded
 
 
 def _export(options: argparse.Namespace) -> int:
@@ -827,18 +816,17 @@ def _export(options: argparse.Namespace) -> int:
     problem, plan = read_problem(options), None
     _check_step(options, problem)
     if options.plan is not None:
-        problem, plan, *_ = _load_replayed(options, silent=False)
+        problem, plan, _ = _load_replayed(options)
     with name_source(options.problem):
         write_text(options.mjcf, wholearm.write_mjcf(problem, plan, step=options.step))
     return finish(options, None, options.mjcf)
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from ..engines.engine_replay import ALLOWED, require_engine
-    from ..engines.interface import Setting
+    from ..engines.engine_replay import ALLOWED, Setting, require_engine
 
     require_engine(options.engine)
-    problem, plan, policy, notes = _load_replayed(options, options.json)
+    problem, plan, policy = _load_replayed(options)
     _check_step(options, problem)
     setting = Setting()._replace(**list_given(options, "softness"))
     if options.step is not None:
@@ -849,13 +837,13 @@ def _replay(options: argparse.Namespace) -> int:
         arguments |= {"allowed": options.departure, "halvings": options.refine}
         with name_source(options.problem):
             replays = wholearm.replay_in(options.engine, problem, plan, **arguments)
-        return finish(options, replays, notes=notes)
+        return finish(options, replays)
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
     arguments["allowed"] = ALLOWED if options.departure is None else options.departure
     with name_source(options.policy):
         report = wholearm.play_policy(options.engine, problem, plan, policy, **arguments)
-    return finish(options, report, notes=notes)
+    return finish(options, report)
 
 
 def _policy(options: argparse.Namespace) -> int:
@@ -957,16 +945,16 @@ def _sweep(options: argparse.Namespace) -> int:
 
 def _sensitivities(options: argparse.Namespace) -> int:
     require_output(options.output)
-    problem, notes = wholearm.load(options.problem), dict[str, list[str]]()
+    problem = wholearm.load(options.problem)
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
     if options.plan is not None:
-        problem, _, _, notes = load_plan(options, options.plan, options.json)
+        problem, *_ = load_plan(options, options.plan)
         plan_options = wholearm.load_plan(options.plan).options
     result = wholearm.find_sensitivities(
         problem, plan_options, options.of, options.jobs, show_progress, not options.differences
     )
     save_figure(options.output, "draw_sensitivities", result)
-    return finish(options, result, options.output, notes=notes)
+    return finish(options, result, options.output)
 
 
 def _design(options: argparse.Namespace) -> int:

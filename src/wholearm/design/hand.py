@@ -30,8 +30,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import UNITS, Plan
 from ..problem.definition import Problem
 from ..search import solve
-from .parameters import Parameter, find_parameter, require_allowed
-from .sweep import Planner, read_vary
+from .sweep import Parameter, Planner, find_parameter, read_vary, require_allowed
 
 RADII = (0.3, 0.1)  # of the first trust region of each run of COBYQA, over half a range
 FINE = 1e-2  # radius at which a run ends

@@ -41,8 +41,7 @@ from ..problem.definition import End, Problem
 from ..problem.read import require_phases
 from ..search import solve as solve_any
 from ..simulation.modes import require_closed
-from .parameters import Parameter, find_parameter, list_parameters
-from .sweep import name_limit
+from .sweep import Parameter, find_parameter, list_parameters, name_limit
 
 Terms = list[tuple[str, str, float]]
 """Parts of a Lagrangian, or of a value: phases and limit that they come from, and how much."""

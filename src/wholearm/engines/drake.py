@@ -20,7 +20,7 @@ from pydrake.systems.primitives import TrajectorySource
 from ..common.arrays import Array
 from ..problem.definition import Problem
 from ..scene.model import Scene
-from . import interface as engine
+from . import engine_replay as engine
 
 _EVERY = 4  # steps from one look at the forces to the next: contacts swing ten times as slowly
 
@@ -35,7 +35,7 @@ def play(
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.ERROR)
-    diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
+    diagram, plant, pairs = _build(problem.scene, steps, setting)
     simulator = Simulator(diagram)
     log.setLevel(level)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -73,11 +73,11 @@ def play(
 
 
 def _build(
-    scene: Scene, steps: engine.Steps, setting: engine.Setting, plays: bool
+    scene: Scene, steps: engine.Steps, setting: engine.Setting
 ) -> tuple[Any, Any, dict[Any, int]]:
     """Diagram, plant, and the numbers of pairs by the identities of their shapes.
 
-    If it `plays`, the torques of the steps are part of it.
+    Torques that are no feedback are part of it.
     """
     builder = DiagramBuilder()
     plant, graph = multibody.AddMultibodyPlantSceneGraph(builder, steps.h)
@@ -88,14 +88,13 @@ def _build(
     pairs = _add_shapes(plant, graph, scene, setting)
     plant.Finalize()
     plant.set_stiction_tolerance(1e-5 * scene.scales.speed)
-    if not plays:
-        return builder.Build(), plant, pairs
-    # Held from half a step before each step on, so that rounding of times does not matter.
-    breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
-    rows = np.vstack([steps.tau, steps.tau[-1:]]).T
-    torques = trajectories.PiecewisePolynomial.ZeroOrderHold(breaks, rows)
-    source = builder.AddSystem(TrajectorySource(torques))
-    builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
+    if steps.drive is None:
+        # Held from half a step before each step on, so that rounding of times does not matter.
+        breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
+        rows = np.vstack([steps.tau, steps.tau[-1:]]).T
+        torques = trajectories.PiecewisePolynomial.ZeroOrderHold(breaks, rows)
+        source = builder.AddSystem(TrajectorySource(torques))
+        builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
     return builder.Build(), plant, pairs
 
 

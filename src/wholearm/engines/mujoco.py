@@ -19,7 +19,7 @@ from ..results.adopt import Moved, adopt_motion
 from ..results.torque import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from . import interface as engine
+from . import engine_replay as engine
 
 SHARE = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""

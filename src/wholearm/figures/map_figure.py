@@ -21,7 +21,6 @@ from matplotlib.patheffects import withStroke
 
 from ..common.arrays import Array, Flags, Numbers, find_runs, interpolate
 from ..common.sharing import exclusive
-from ..contacts.elemental import Contact
 from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
 from ..results.adopt import Moved, adopt_motion
@@ -132,7 +131,11 @@ class _Drawing:
             upright = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
             # 8 points from the plan.
             clear &= (across[None] + upright[:, None]).min(axis=2) > 64.0
-        names = [" | ".join(map(_shorten, formation)) for formation in self.chart.formations]
+        # A star: the vertex is on the tip's arc.
+        names = [
+            " | ".join(f"{c.corner}{'*' * (c.surface == 'tip' and c.feature == 'v')}" for c in each)
+            for each in self.chart.formations
+        ]
         boxes = [self._write_inside(names[k], region & clear) for k, region in self.parts]
         look: Any = {"color": "#666666", "style": "italic"}
         look["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]  # over the hatching
@@ -254,12 +257,6 @@ class _Drawing:
 def _to_axes(points: Array) -> Array:
     """From m and rad to the units of the axes, mm and deg."""
     return np.column_stack([1e3 * points[:, 0], np.degrees(points[:, 1])])
-
-
-def _shorten(contact: Contact) -> str:
-    """The name of a contact in a cell's label."""
-    rounded = contact.surface == "tip" and contact.feature == "v"
-    return f"{contact.corner}{'*' if rounded else ''}"
 
 
 def _head(run: Array) -> Array:

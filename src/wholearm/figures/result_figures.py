@@ -25,8 +25,7 @@ from ..common.sharing import exclusive
 from ..planning.options import Objective
 from ..verification.newton_euler import place_object
 from . import style
-from .plots import draw_margins, draw_phases
-from .snapshots import trace_link
+from .plots import draw_margins, draw_phases, trace_link
 
 if TYPE_CHECKING:
     from ..analysis.comparison import Comparison

@@ -32,7 +32,7 @@ from ..mechanics.impact import Impact, compute_impact
 from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import End, Phase, Problem
 from ..results.dwell_record import TorqueChange, change_torques
-from ..results.plan_record import Transition
+from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .lower_bound import look_along

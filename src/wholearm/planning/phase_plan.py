@@ -18,7 +18,7 @@ from ..geometry.tracing import runs_on_curves
 from ..mechanics.impact import Impact
 from ..problem.definition import Phase
 from ..results.dwell_record import Settling, assemble
-from ..results.plan_record import Transition
+from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
 from .options import Objective, PlanOptions

@@ -25,8 +25,7 @@ from ..mechanics.statics import SURE
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import require_phases
-from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transition
-from ..results.report import UniquenessMargin
+from ..results.report import Certificate, RangeFigures, TimeBound, Transition, UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..verification.verdict import EXACT_REST, find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks

@@ -17,8 +17,7 @@ from ..common.errors import InfeasibleError, JammingError, ReplayError, Simulati
 from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.dwell_record import assemble
-from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
-from ..results.report import Report
+from ..results.report import LeastForce, ReplayedPhase, ReplayFigures, Report
 from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales

@@ -18,9 +18,8 @@ from ..common.errors import InputError, name_source
 from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import read_own_problem
 from ..results.dwell_record import Settling
-from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
-from ..results.report import UniquenessMargin
-from ..results.trajectory import Samples, Trajectory, load_trajectory
+from ..results.report import Certificate, RangeFigures, ReplayFigures, Transition, UniquenessMargin
+from ..results.trajectory import ModeSpan, Samples, Trajectory, load_trajectory
 from .nlp import SolverStatistics
 from .options import Objective, PlanOptions
 from .phase_plan import combine

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -114,24 +114,21 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
     InputError if it makes no sense for the problem: the object has other vertices, by number, or
     the hand is another one, a base or a length being off by more than a tenth of the link.
     """
-    tables = meta.get("problem")
-    if not isinstance(tables, Mapping):
+    own = meta.get("problem")
+    if not isinstance(own, Mapping):
         return ""
-    for difference in _find(tables, problem):
-        if other := _find_other(difference, problem):
-            given = f"{difference.one} in the {what}, {difference.other} here"
-            raise InputError("", difference.key, f"{given}; {other}")
-    text = describe_differences(_find(tables, problem), f"in the {what}", "here")
-    return f"made for another problem: {text}" if text else ""
-
-
-def _find(own: Mapping[str, Any], problem: Problem) -> Iterator[Difference]:
     with suppress(InputError):
         # Files of earlier versions have the tables as they were written by hand.
         own = build_problem(own).table or own
     # Phases take the place of goals in plans.
     free = (*_FREE, ".phases") if "goal" in problem.table else _FREE
-    return find_differences(own, problem.table, free)
+    found = list(find_differences(own, problem.table, free))
+    for difference in found:
+        if other := _find_other(difference, problem):
+            given = f"{difference.one} in the {what}, {difference.other} here"
+            raise InputError("", difference.key, f"{given}; {other}")
+    text = describe_differences(found, f"in the {what}", "here")
+    return f"made for another problem: {text}" if text else ""
 
 
 def _find_other(found: Difference, problem: Problem) -> str:

@@ -21,9 +21,8 @@ import numpy as np
 
 from ..common.arrays import Array, Flags, sort_unique
 from ..scene.model import Scene
-from .plan_record import ModeSpan
 from .torque import TorqueProfile
-from .trajectory import Motion, Samples, Trajectory
+from .trajectory import ModeSpan, Motion, Samples, Trajectory
 
 
 @dataclass(frozen=True, eq=False)

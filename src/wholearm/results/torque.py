@@ -234,7 +234,8 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
     InputError if the rate is not a positive number or gives fewer than two samples, or the
     interpolation is another one.
     """
-    rate = require_sampling(rate, interpolation)
+    choice("linear", "hold").read(interpolation, "interpolation")
+    rate = require_number(rate, "sample_rate", positive=True)
     start, count = torque.breaks[0], torque.duration * rate
     if not 1 <= count <= 1e7:
         needed = f"{1 / torque.duration:.4g} to {1e7 / torque.duration:.4g} Hz"
@@ -246,12 +247,6 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
         return np.column_stack([t, tau])
     held = np.repeat(tau[:-1], 2, axis=0)
     return np.column_stack([np.repeat(t, 2)[1:-1], held])
-
-
-def require_sampling(rate: object, interpolation: str) -> float:
-    """The rate [Hz] as a number; an `InputError` if it or the interpolation is not allowed."""
-    choice("linear", "hold").read(interpolation, "interpolation")
-    return require_number(rate, "sample_rate", positive=True)
 
 
 def format_rows(rows: Array, commands: Array | None = None) -> str:

@@ -16,10 +16,19 @@ from ..common.arrays import Array, Flags, Numbers, sort_unique
 from ..common.document import Drawn, restore
 from ..common.errors import InputError
 from ..common.files import read_arrays, require_ending, write_text, write_whole
-from .plan_record import ModeSpan
 from .torque import MOST, TorqueProfile, format_rows, place_rows
 
+ROLLS = "rolls"  # mode of a contact that rolls; one that slides has the sign of its direction
 _PARTS = slice(3), slice(3, 5)  # of z: q and theta
+
+
+class ModeSpan(NamedTuple):
+    """A stretch of a phase in which every contact keeps its mode."""
+
+    start: float  # start, stop [s]: from the start of the phase
+    stop: float
+    contacts: Mapping[str, str]  # ``"+"``, ``"-"`` or ``"rolls"`` by the name of the contact
+    joints: tuple[str, ...]  # which way each joint turns, ``"+"`` or ``"-"``
 
 
 class Samples(NamedTuple):

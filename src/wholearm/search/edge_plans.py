@@ -40,7 +40,7 @@ from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
 from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
-from ..results.plan_record import ROLLS
+from ..results.trajectory import ROLLS
 from ..scene.model import Scene
 from .edges import DEPENDENT, Edge, EdgeStep, describe_steps, point_out
 from .places import RoadmapPlace, close_place

@@ -24,7 +24,7 @@ from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
-from ..results.plan_record import Deviation
+from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases

@@ -18,8 +18,7 @@ from ..mechanics import UNIQUENESS
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem
-from ..results.plan_record import Deviation
-from ..results.report import Failure, FingerGap, PhaseReport, UniquenessMargin
+from ..results.report import Deviation, Failure, FingerGap, PhaseReport, UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation

@@ -23,7 +23,7 @@ from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem
 from ..results import report as results
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
-from ..results.plan_record import Deviation
+from ..results.report import Deviation
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
 from ..simulation import modes

@@ -22,12 +22,11 @@ from ..common.document import fixed
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
-from ..figures import snapshots, style
-from ..figures.plots import draw_margins, draw_phases, draw_torques
+from ..figures import plots, style
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .page import Pushes
+from ..verification.newton_euler import locate
 
 FRAMES = 25  # frames in a second of the movie
 TURNS, GHOST = "#D55E00", "#bbbbbb"
@@ -38,8 +37,13 @@ def _prepare_scene(
     axes: Axes, scene: Scene, trajectory: Trajectory, ghost: Trajectory | None
 ) -> Callable[[float], list[Artist]]:
     """What draws hand, object and forces on axes at an instant, anew for each frame."""
-    points, normals, tangents, forces, friction = Pushes.of(scene, trajectory)
-    low, high = snapshots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
+    touches = [locate(scene, name, trajectory.z) for name in trajectory.contacts]
+    points, normals, tangents = (  # (n, m, 2)
+        np.stack([getattr(touch, name)[:, :2] for touch in touches], axis=1)
+        for name in ("point", "normal", "tangent")
+    )
+    forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
+    low, high = plots.measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
     size = float((high - low).max())
     styles = style.choose_styles(trajectory.contacts)
     colours = [styles[name].colour for name in trajectory.contacts]
@@ -51,7 +55,7 @@ def _prepare_scene(
     presses = np.asarray(np.isfinite(forces).all(axis=2))
     # Friction cones are longer than the arrows in them.
     reach = 1.15 * np.maximum(np.hypot(*arrows.T).T, 0.03 * size)[..., None]
-    edges = friction[:, None] * tangents
+    edges = np.array([[touch.friction] for touch in touches]) * tangents
     sides = [points + reach * (normals + sign * edges) for sign in (1, -1)]
     cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
     every = np.vstack([low, high, cones[presses].reshape(-1, 2)])
@@ -59,10 +63,10 @@ def _prepare_scene(
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal")
     axes.set_axis_off()
-    snapshots.draw_palm(axes, scene, low[0], high[0])
-    scale, vertices = snapshots.measure_scale(axes), scene.polygon.vertices
-    shifts = snapshots.choose_numbers(scale * vertices)
-    numbers = {k: vertices[k] + shift / scale for k, shift in shifts.items()}
+    plots.draw_palm(axes, scene, low[0], high[0])
+    scale, vertices = plots.measure_scale(axes), scene.polygon.vertices
+    shifts = plots.choose_numbers(scale * vertices)
+    numbers = vertices[[*shifts]] + np.reshape([*shifts.values()], (-1, 2)) / scale
 
     def draw(t: float) -> list[Artist]:
         """Everything at an instant, in the order of drawing."""
@@ -71,12 +75,13 @@ def _prepare_scene(
         z = interpolate(t, trajectory.t, trajectory.z)
         if ghost is not None:
             behind = interpolate(t, ghost.t, ghost.z)
-            artists += snapshots.draw_bodies(axes, scene, behind, ec=GHOST, fc="none")
-        artists += snapshots.draw_bodies(axes, scene, z)
-        places = snapshots.turn(z, np.array([*numbers.values()]).reshape(-1, 2))
+            artists += plots.draw_bodies(axes, scene, behind, ec=GHOST, fc="none")
+        artists += plots.draw_bodies(axes, scene, z)
+        c, s = math.cos(z[2]), math.sin(z[2])
+        places = z[:2] + numbers @ np.array([[c, s], [-s, c]])
         look: Any = {"ha": "center", "va": "center", "color": "#555555"}
-        look["fontsize"] = snapshots.NUMBER
-        for k, (x, y) in zip(numbers, places.tolist(), strict=True):
+        look["fontsize"] = plots.NUMBER
+        for k, (x, y) in zip(shifts, places.tolist(), strict=True):
             artists.append(axes.text(x, y, str(k), **look))
         pressing = np.flatnonzero(presses[row]).tolist()
         for k in pressing:
@@ -92,7 +97,7 @@ def _prepare_scene(
             swept = 1.5 * math.pi * torque / finger.torque_limit
             arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * size)
             artists.append(style.add_line(axes, arc, color=TURNS, lw=1.6))
-        return artists + snapshots.draw_joints(axes, scene)
+        return artists + plots.draw_joints(axes, scene)
 
     return draw
 
@@ -153,10 +158,10 @@ def write_movie(
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
             styles = style.choose_styles(trajectory.contacts)
-            draw_margins(margins, trajectory, problem.epsilon, styles)
-            draw_torques(torques, trajectory.torque, problem.scene.torque_limit)
+            plots.draw_margins(margins, trajectory, problem.epsilon, styles)
+            plots.draw_torques(torques, trajectory.torque, problem.scene.torque_limit)
             for axes, room in ((margins, 0.235), (torques, 0.14)):
-                draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
+                plots.draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
                 style.list_contacts(axes, 72 * 7.4 * room, 8.0)
             margins.set_ylabel(f"margin {style.unit_of(margins)}")
             margins.tick_params(labelbottom=False)

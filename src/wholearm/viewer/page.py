@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from html import escape
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -54,59 +54,38 @@ def _embed(value: dict[str, Any]) -> str:
     return f'<script type="application/json">{text}</script>'
 
 
-class Pushes(NamedTuple):
-    """Contacts and their forces at the n samples of a trajectory."""
-
-    points: Array  # (n, m, 2) [m]
-    normals: Array  # (n, m, 2): into the object
-    tangents: Array  # (n, m, 2)
-    forces: Array  # (n, m, 2) [N]: NaN where a contact has none, or none is known
-    friction: Array  # (m,): coefficients mu
-
-    @staticmethod
-    def of(scene: Scene, trajectory: Trajectory) -> Pushes:
-        """Those of a trajectory."""
-        touches = [locate(scene, name, trajectory.z) for name in trajectory.contacts]
-        points = np.stack([touch.point for touch in touches], axis=1)
-        normals = np.stack([touch.normal[:, :2] for touch in touches], axis=1)
-        tangents = np.stack([touch.tangent[:, :2] for touch in touches], axis=1)
-        forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
-        friction = np.array([touch.friction for touch in touches])
-        return Pushes(points, normals, tangents, forces, friction)
-
-
 def describe_motion(
     trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = 4000
 ) -> dict[str, Any]:
     """What a page needs to play a motion, of `most` samples or so, with a replay behind it."""
-    scene, pushes = problem.scene, Pushes.of(problem.scene, trajectory)
-    styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
+    scene, styles = problem.scene, choose_styles(trajectory.contacts)
+    every = trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)
     contacts = list[dict[str, Any]]()
     for index, name in enumerate(trajectory.contacts):
+        touch = locate(scene, name, trajectory.z[rows])
         c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
         # When the contact presses: the first row, and from there on places, normals and forces.
         spans = [
             {
                 "first": run.start,
-                "point": _fix(pushes.points[rows[run], index], scene),
-                "normal": _fix(pushes.normals[rows[run], index], scene),
+                "point": fix(touch.point[run], scene),
+                "normal": fix(touch.normal[run, :2], scene),
                 "c": _round(c[run]),
             }
             for run in find_runs(np.isfinite(c).all(axis=1), least=2)
         ]
         dashes = [] if styles[name].line == "-" else list(styles[name].line[1])
         look = {"name": name, "colour": styles[name].colour, "dashes": dashes}
-        friction = float(pushes.friction[index])
-        contacts.append(look | {"friction": friction, "spans": spans})
+        contacts.append(look | {"friction": touch.friction, "spans": spans})
     behind = None
     if ghost is not None:
         few = _choose_rows(ghost, every[:0], most)
-        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few], scene)}
+        behind = {"t": _round(ghost.t[few]), "z": fix(ghost.z[few], scene)}
     return describe_hand(scene) | {
         "epsilon": problem.epsilon,
         "t": _round(trajectory.t[rows]),
-        "z": _fix(trajectory.z[rows], scene),
+        "z": fix(trajectory.z[rows], scene),
         "tau": _round(trajectory.tau[rows]),
         "phase": trajectory.phase[rows].tolist(),
         "starts": _round(trajectory.phase_starts),
@@ -141,14 +120,12 @@ def describe_hand(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _fix(values: Array, scene: Scene) -> Any:
-    """Nested lists of places, directions or angles [m, rad]."""
-    return np.round(values, count_places(scene)).tolist()
+def fix(values: Array, scene: Scene) -> Any:
+    """Nested lists of places, directions or angles [m, rad].
 
-
-def count_places(scene: Scene) -> int:
-    """Decimals of places and angles in a page: 5 for an object of a centimetre or more."""
-    return max(5, 3 - math.floor(math.log10(scene.scales.length)))
+    They have 5 decimals for an object of a centimetre or more.
+    """
+    return np.round(values, max(5, 3 - math.floor(math.log10(scene.scales.length)))).tolist()
 
 
 def _round(values: Array) -> Any:

@@ -165,8 +165,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
     poses = close_fingers(scene, *middles.T).z
 
     def describe(contacts: Iterable[Contact], text: str, z: Array) -> dict[str, Any]:
-        names, values = [c.name for c in contacts], np.round(z, page.count_places(scene)).tolist()
-        return {"contacts": names, "text": text, "z": values}
+        return {"contacts": [c.name for c in contacts], "text": text, "z": page.fix(z, scene)}
 
     places = []
     for (index, _), point, z in zip(parts, middles, poses, strict=True):

@@ -14,9 +14,8 @@ from ...common.arrays import Array
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, forward, metric_weights, move_least, split_forces
-from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
-from ...results.trajectory import Samples
+from ...results.trajectory import ROLLS, ModeSpan, Samples
 from .stage import Scheme, Stage, StagePoints, blend
 
 _NODES = 8  # places per interval at which the equations of motion are solved

@@ -33,7 +33,7 @@ from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase, Problem
-from ...results.plan_record import Transition
+from ...results.report import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
