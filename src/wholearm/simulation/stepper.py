@@ -17,7 +17,7 @@ edition, section II.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -166,125 +166,102 @@ class ModeStepper:
 @lru_cache(maxsize=256)
 def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeStepper:
     """Steps of a set of modes without its signs, for torques of a polynomial degree."""
-    return _Equations(structure, modes, degree).compile()
+    n, k, held = structure.n, len(modes.kept), list(modes.held)
+    groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
+    s = len(groups) + len(held)
+    numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
+    sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
+    ends = np.cumsum([0, *sizes]).tolist()
+    x = Inputs(*map(ca.SX.sym, Inputs._fields, sizes))._replace(geometry=structure.geometry)
+    rows = EventRows(*(slice(*pair) for pair in pairwise(np.cumsum([0, k, 2 * s, k, n]).tolist())))
+    stage, report, project = _build_motion(structure, modes, groups, x)
+    # One vector takes less time than many.
+    packed = ca.MX.sym("inputs", ends[-1])
+    at, stages = Inputs(*ca.vertsplit(packed, ends)), list[Expression]()
+
+    def rate(state: Expression, time: Expression) -> Expression:
+        rates, margins = stage(state, time, packed)
+        stages.append(margins)
+        return rates
+
+    end, fifth, third = build_step(rate, at.y, at.t, at.h, 2 * n)
+    error = build_error(fifth, third, at.y[: 2 * n], at.units, at.tolerance)
+    seen = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
+    end = ca.vertcat(project(at, end[: 2 * n]), end[2 * n :])
+    inputs, functions = np.zeros(ends[-1]), []
+    for state, time, extra in (
+        (end, at.t + at.h, (error, seen)),
+        (at.y, at.t, (0, ca.DM.zeros(seen.shape[0]))),
+    ):
+        every = [state, *report(state[: 2 * n], time, packed), *map(ca.MX, extra)]
+        functions.append(ca.Function("step", [packed], [ca.densify(ca.vertcat(*every))]))
+    stops = np.cumsum([part.shape[0] for part in every])
+    outputs = np.zeros(stops[-1])
+    step, look = (bind(function, [inputs], [outputs]) for function in functions)
+    views = Inputs(*np.split(inputs, ends[1:-1])), Outputs(*np.split(outputs, stops[:-1]))
+    return ModeStepper(modes, *views, rows, step, look)
 
 
-class _Equations:
-    """Equations of motion, as expressions of the inputs."""
+def _build_motion(
+    structure: Structure, modes: Modes, groups: Sequence[Sequence[int]], x: Inputs
+) -> tuple[Expression, Expression, Callable[[Inputs, Expression], Expression]]:
+    """Equations of motion with inputs x; `groups` are the rows of what sticks among `modes.kept`.
 
-    def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
-        self.structure, self.modes, self.n = structure, modes, structure.n
-        self.v = ca.SX.sym("v", structure.n)
-        self.contact_rows = structure.build_rows(modes.kept, self.v)
-        self.groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
-        n, k, s = self.n, len(modes.kept), len(modes.stuck) + len(modes.held)
-        numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
-        sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
-        self.ends = np.cumsum([0, *sizes]).tolist()
-        x = Inputs(*map(ca.SX.sym, Inputs._fields, sizes))
-        self.x = x._replace(geometry=structure.geometry)
-        ends = np.cumsum([0, k, 2 * s, k, n]).tolist()
-        force, cone, slide, turn = (slice(*pair) for pair in pairwise(ends))
-        self.rows = EventRows(force, cone, slide, turn)
+    Two CasADi functions of z and z', the time and the inputs in one column: rates of the state and
+    margins, then the outputs from the acceleration to the event values. A function of the inputs
+    and (z, z'): its projection on the constraints, in the metric M.
+    """
+    n, k, held, z = structure.n, len(modes.kept), list(modes.held), structure.z
+    v, time, mu, lift = ca.SX.sym("v", n), ca.SX.sym("time"), x.mu, x.lift
+    gap, slip, A, A_t, bend, bend_t = structure.build_rows(modes.kept, v)
+    slides, first = np.ones(k), [rows[0] for rows in groups]
+    slides[[row for rows in groups for row in rows]] = 0.0
+    rub = mu * x.Xi * ca.DM(slides)
+    hold = A_t[first, :], ca.DM(np.eye(n)[held].reshape(-1, n))
+    P, G = (ca.vertcat(part, *hold) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
+    curve = ca.vertcat(bend, *(bend_t[row] for row in first), ca.DM(len(held), 1))
+    tau = _build_torque(time, x.piece, x.torque)
+    viscous, dry = x.viscous * v, x.dry * x.sigma
+    drive = ca.SX(n, 1)
+    for row, coordinate in enumerate(structure.driven):
+        drive[coordinate] = tau[row]
+    force, c, ratio = x.applied + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
+    if P.shape[0]:
+        c, ratio = _build_solution(*P.shape)(P, G, lift, force, curve)
+        force = force + G.T @ c
+    acceleration, v_t, (c_n, f) = lift * force, A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
+    losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
+    losses.append(ca.dot(rub * c_n, v_t))
+    bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups] + [x.dry[i] for i in held]
+    units = [x.scales[0]] * len(groups) + [x.friction_units[i] for i in held]
+    bound, unit = (ca.vertcat(ca.SX(0, 1), *part) for part in (bounds, units))
+    margins = ca.vertcat(c_n / x.scales[0], (bound - f) / unit, (bound + f) / unit)
+    speeds = x.Xi * v_t / x.scales[1], x.sigma * v / x.units[n:]
+    c_t = -rub * c_n
+    for rows, friction in zip(groups, ca.vertsplit(f)[: len(groups)], strict=True):
+        share = c_n[rows] / ca.fmax(ca.sum1(c_n[rows]), 1e-300) if len(rows) > 1 else 1
+        c_t[rows] = friction * share
+    results = (
+        [ca.vertcat(v, acceleration, *losses), margins],
+        [acceleration, tau, c_n, c_t, ratio, ca.vertcat(margins, *speeds)],
+    )
+    inputs = [ca.vertcat(z, v), time, ca.vertcat(*x)]
+    stage, report = (ca.Function("of_state", inputs, list(map(ca.densify, r))) for r in results)
+    stays = ca.vertcat(ca.SX(0, 1), *(slip[row] for row in first), *(z[i] for i in held))
+    off = ca.vertcat(gap, stays - x.stay)
+    constraints = ca.Function("rows", [z, x.stay, x.geometry], [ca.densify(P), ca.densify(off)])
 
-    def compile(self) -> ModeStepper:
-        """Steps, and looks at a state, as functions of the inputs."""
-        n = self.n
-        stage, report = self._build_motion()
-        # One vector takes less time than many.
-        packed = ca.MX.sym("inputs", self.ends[-1])
-        x, stages = Inputs(*ca.vertsplit(packed, self.ends)), list[Expression]()
-
-        def rate(state: Expression, time: Expression) -> Expression:
-            rates, margins = stage(state, time, packed)
-            stages.append(margins)
-            return rates
-
-        end, fifth, third = build_step(rate, x.y, x.t, x.h, 2 * n)
-        error = build_error(fifth, third, x.y[: 2 * n], x.units, x.tolerance)
-        seen = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
-        end = ca.vertcat(self._project(x, end[: 2 * n]), end[2 * n :])
-        inputs, functions = np.zeros(self.ends[-1]), []
-        for state, time, extra in (
-            (end, x.t + x.h, (error, seen)),
-            (x.y, x.t, (0, ca.DM.zeros(seen.shape[0]))),
-        ):
-            every = [state, *report(state[: 2 * n], time, packed), *map(ca.MX, extra)]
-            functions.append(ca.Function("step", [packed], [ca.densify(ca.vertcat(*every))]))
-        stops = np.cumsum([part.shape[0] for part in every])
-        outputs = np.zeros(stops[-1])
-        step, look = (bind(function, [inputs], [outputs]) for function in functions)
-        views = Inputs(*np.split(inputs, self.ends[1:-1])), Outputs(*np.split(outputs, stops[:-1]))
-        return ModeStepper(self.modes, *views, self.rows, step, look)
-
-    def _stack(self, normal: Expression, tangential: Expression) -> Expression:
-        """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
-        hold = ca.DM(np.eye(self.n)[list(self.modes.held)].reshape(-1, self.n))
-        return ca.vertcat(normal, *(tangential[rows[0], :] for rows in self.groups), hold)
-
-    def _build_motion(self) -> tuple[Expression, Expression]:
-        """CasADi functions of z and z', the time and the inputs in one column.
-
-        The first one returns rates of the state and margins; the second one the outputs from the
-        acceleration to the event values.
-        """
-        structure, n, groups, x = self.structure, self.n, self.groups, self.x
-        k, held = len(self.modes.kept), list(self.modes.held)
-        v, mu, sigma, lift, time = self.v, x.mu, x.sigma, x.lift, ca.SX.sym("time")
-        slides = np.ones(k)
-        slides[[row for rows in groups for row in rows]] = 0.0
-        rub = mu * x.Xi * ca.DM(slides)
-        _, _, A, A_t, bend, bend_t = self.contact_rows
-        P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
-        curve = ca.vertcat(bend, *(bend_t[rows[0]] for rows in groups), ca.DM(len(held), 1))
-        tau = _build_torque(time, x.piece, x.torque)
-        viscous, dry = x.viscous * v, x.dry * sigma
-        drive = ca.SX(n, 1)
-        for row, coordinate in enumerate(structure.driven):
-            drive[coordinate] = tau[row]
-        force, c, ratio = x.applied + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
-        if P.shape[0]:
-            c, ratio = _build_solution(*P.shape)(P, G, lift, force, curve)
-            force = force + G.T @ c
-        acceleration, v_t, (c_n, f) = lift * force, A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
-        losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
-        losses.append(ca.dot(rub * c_n, v_t))
-        bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups]
-        bounds += [x.dry[i] for i in held]
-        units = [x.scales[0]] * len(groups) + [x.friction_units[i] for i in held]
-        bound, unit = (ca.vertcat(ca.SX(0, 1), *part) for part in (bounds, units))
-        margins = ca.vertcat(c_n / x.scales[0], (bound - f) / unit, (bound + f) / unit)
-        speeds = x.Xi * v_t / x.scales[1], sigma * v / x.units[n:]
-        c_t = -rub * c_n
-        for rows, friction in zip(groups, ca.vertsplit(f)[: len(groups)], strict=True):
-            share = c_n[rows] / ca.fmax(ca.sum1(c_n[rows]), 1e-300) if len(rows) > 1 else 1
-            c_t[rows] = friction * share
-        stage = [ca.vertcat(v, acceleration, *losses), margins]
-        report = [acceleration, tau, c_n, c_t, ratio, ca.vertcat(margins, *speeds)]
-        inputs = [ca.vertcat(structure.z, v), time, ca.vertcat(*x)]
-        return (
-            ca.Function("stage", inputs, [ca.densify(part) for part in stage]),
-            ca.Function("report", inputs, [ca.densify(part) for part in report]),
-        )
-
-    def _project(self, at: Inputs, state: Expression) -> Expression:
-        """The projection of z and z', with some inputs, on the constraints, in the metric M.
-
-        A step leaves gaps of the size of its error, so one Newton iteration closes them.
-        """
-        n, x, z = self.n, self.x, self.structure.z
-        gap, slip, A, A_t, _, _ = self.contact_rows
-        P = self._stack(A, A_t)
+    def project(at: Inputs, state: Expression) -> Expression:
         if not P.shape[0]:
             return state
-        stays = [*(slip[rows[0]] for rows in self.groups), *(z[i] for i in self.modes.held)]
-        off = ca.vertcat(gap, ca.vertcat(ca.SX(0, 1), *stays) - x.stay)
-        rows = ca.Function("rows", [z, x.stay, x.geometry], [ca.densify(P), ca.densify(off)])
+        # A step leaves gaps of the size of its error, so one Newton iteration closes them.
         correct, speed = _build_correction(*P.shape), state[n:]
-        P, off = rows(state[:n], at.stay, at.geometry)
-        place = state[:n] - correct(P, off, at.lift)
-        P, _ = rows(place, at.stay, at.geometry)
-        return ca.vertcat(place, speed - correct(P, P @ speed, at.lift))
+        rows, off = constraints(state[:n], at.stay, at.geometry)
+        place = state[:n] - correct(rows, off, at.lift)
+        rows, _ = constraints(place, at.stay, at.geometry)
+        return ca.vertcat(place, speed - correct(rows, rows @ speed, at.lift))
+
+    return stage, report, project
 
 
 @lru_cache(maxsize=16)
