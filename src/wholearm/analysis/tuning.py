@@ -28,7 +28,7 @@ from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
 from ..verification import free
-from ..verification.verdict import DEPARTURE
+from ..verification.verify import DEPARTURE
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
 FACTOR = 1.1

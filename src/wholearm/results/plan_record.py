@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,6 +16,11 @@ class Deviation(NamedTuple):
     position: float  # [m]: of the coordinates x and y
     angle: float  # [rad]: of phi and the joint angles
     time: float  # [s]: when the larger of the two was, positions counting over the scene's length
+
+    def measure(self, length: float) -> float:
+        """Its size, over the scene's `length` [m] and in rad; zero where none is known."""
+        sizes = self.position / length, self.angle
+        return max((size for size in sizes if not math.isnan(size)), default=0.0)
 
 
 class ModeSpan(NamedTuple):

@@ -29,7 +29,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verdict import DEPARTURE, measure_departure
+from .verify import DEPARTURE
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -89,7 +89,7 @@ def verify_free(
             title, end = f"phase {phase.number} alone", phase.deviation
             failures += [f"{title}: {loss.describe()}" for loss in phase.losses]
             assert end is not None
-            if measure_departure(end, problem.scene.scales.length) > allowed:
+            if end.measure(problem.scene.scales.length) > allowed:
                 away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
                 failures.append(f"{title} ends {away}")
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
