@@ -277,6 +277,10 @@ class Run(ABC):
             if ending is not None:
                 return ending
 
+    def begin_step(self) -> None:
+        """Start the next step from the state whose event values are known."""
+        self.start = self.values
+
     def try_step(self, target: float) -> tuple[float, bool]:
         """Make a step within the tolerance, to `target` [s] at most.
 
@@ -285,7 +289,7 @@ class Run(ABC):
         h, whole  its length [s] and whether it ends at `target`
         """
         remaining, time = target - self.t, self.system.scales.time
-        self.start = self.values
+        self.begin_step()
         least = SHORTEST_STEP * max(time, abs(self.t))
         while True:
             h = min(self.h, self.longest)
