@@ -177,11 +177,10 @@ class Replay(Run):
     def signs(self, signs: Array) -> None:
         self.s.inputs.Xi[:], self.s.inputs.sigma[3:] = signs[:-2], signs[-2:]
 
-    def take(self, mode: modes.Mode) -> None:
-        """Go on with the steps of a mode of the phase's formation."""
+    def take(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
+        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
         self.load(mode.find_modes())
-        self.signs = np.zeros(self.formation.n_contacts + 2)
-        self.mode, self.heading = mode, np.zeros(5)
+        self.mode, self.signs, self.heading = mode, signs, heading
         rows, count = self.s.rows, len(self.ends.texts)
         self.turning = slice(rows.slide.start, rows.slide.stop + 2)
         self.limit = slice(self.turning.stop, self.turning.stop + count)
@@ -600,7 +599,8 @@ class Replay(Run):
             side = math.copysign(1.0, self.y[row] - value)
         self.ends = _build_ends(formation, until, side)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
-        self.take(modes.find_mode(formation, np.ones(formation.n_contacts + 2)))
+        none = np.zeros(formation.n_contacts + 2)
+        self.take(modes.find_mode(formation, none + 1), none, np.zeros(5))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
@@ -647,22 +647,15 @@ class Replay(Run):
             fixed = modes.find_fixed(mode, modes.evaluate_rows(formation, self.z, self.v))
             gripped = (row for u in modes.list_units(formation) if u.grips for row in u.rows)
             self.stuck = {row for row in gripped if fixed[row]}
-        self.start_with(mode, signs, departure.heading)
+        self.take(mode, signs, departure.heading)
         self.observe()
         return self.move()
-
-    def start_with(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
-        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
-        if mode != self.mode:
-            self.take(mode)
-        self.signs = signs
-        self.heading = heading
 
     def go_on(self) -> Ending | None:
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
         self.heading = v / np.sqrt(self.system.mass @ v**2)
-        rates = np.concatenate([modes.evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
+        rates = modes.evaluate_rows(formation, self.z, v).A_t @ v
         movable = [row for unit in modes.list_units(formation) for row in unit.rows]
         signs = np.zeros(len(rates))
         signs[movable] = np.where(rates < 0, -1.0, 1.0)[movable]
@@ -728,12 +721,11 @@ class Replay(Run):
         rows = modes.evaluate_rows(formation, self.z, self.v)
         fixed = modes.find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
-        gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
         first = np.array([unit.rows[0] for unit in still])
-        wrong = first[(chosen[first] == 0) | (chosen[first] * (gradients[first] @ self.v) < 0)]
-        rolling = gradients[list(formation.rolling_rows)]
-        self.project_velocity(np.vstack([rows.A, rolling, gradients[wrong]]))
-        self.start_with(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
+        wrong = first[(chosen[first] == 0) | (chosen[first] * (rows.A_t[first] @ self.v) < 0)]
+        stays = [*formation.rolling_rows, *wrong]
+        self.project_velocity(np.vstack([rows.A, rows.A_t[stays]]))
+        self.take(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
         for unit in still:
             row = unit.rows[0]
             before = 0.0 if row in self.stuck else float(signs[row])

@@ -866,7 +866,7 @@ def find_moving(
     That is the friction with which torques `tau` give the recorded `acceleration`, shape (5,).
     """
     scene, rows = formation.scene, modes.evaluate_rows(formation, z, v)
-    speeds = np.concatenate([rows.A_t @ v, v[3:]])
+    speeds = rows.A_t @ v
     units = np.repeat([scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2])
     slow = np.abs(speeds) < 1e-6 * units
     signs = np.sign(speeds)
