@@ -330,27 +330,24 @@ class ClosedContacts:
         adds, root = Independent(DEPENDENT).add, np.sqrt(system.mass)
         A, A_t = at.A / root, at.A_t / root
         kept = {k for k in order if presses[k] and adds(A[k])}
-        count, stuck, held = len(self.standing), [], []
-        Xi, sigma = self.Xi.copy(), self.sigma.copy()
-        sigma[self.joints] = answer.sign[count:]
+        count, held, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()
+        sigma[self.joints] = answer.sign[len(self.standing) :]
+        rows, places = np.vstack([A_t, np.eye(system.n)]), [*self.standing, *(count + self.joints)]
         # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first:
         # decisions in the least-time policy of the square do not end else.
         for j in np.argsort(-answer.shares, kind="stable").tolist():
-            sign = answer.sign[j]
-            if j >= count:
-                joint = int(self.joints[j - count])
-                if sign == 0 and adds(np.eye(system.n)[joint]):
-                    held.append(joint)
-            elif (k := int(self.standing[j])) in kept:
-                Xi[k] = sign
-                if sign == 0 and adds(A_t[k]):
-                    stuck.append(k)
+            row, sign = int(places[j]), answer.sign[j]
+            if row in kept:
+                Xi[row] = sign
+            if sign == 0 and (row in kept or row >= count) and adds(rows[row]):
+                held.append(row)
         # What touches without a force stays, for as long as it needs none.
         kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(A[k])}
         order = sorted(kept)
-        pairs, stick = tuple(closed[k] for k in order), sorted((closed[k],) for k in stuck)
+        below = [*order, *range(count, count + system.n)]
+        holders = tuple((below.index(row),) for row in sorted(held))
         signs = tuple(Xi[order].tolist()), tuple(sigma.tolist())
-        return Modes(pairs, tuple(stick), tuple(sorted(held)), *signs)
+        return Modes(tuple(closed[k] for k in order), holders, *signs)
 
 
 class FreeRun(Run):
@@ -767,7 +764,7 @@ class FreeRun(Run):
     def _holds(self) -> bool:
         """Whether the modes are the only solution after a torque step, by more than rounding."""
         modes, rows, at = self.s.modes, self.s.rows, self.after
-        if not self.unique or modes.stuck or modes.held:
+        if not self.unique or modes.holders:
             return False
         clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
         # What has no direction has no speed that could reverse.

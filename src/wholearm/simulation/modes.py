@@ -99,10 +99,10 @@ class Mode:
 
     def find_modes(self) -> Modes:
         """The same of the pairs of features of the scene, without signs."""
-        pairs, count = _list_pairs(self.formation), self.formation.n_contacts
-        stuck = (rows for rows in self.holders if rows[0] < count)
-        held = tuple(3 + row - count for row in self.held if row >= count)
-        return Modes(pairs, tuple(tuple(pairs[row] for row in rows) for rows in stuck), held)
+        # Coordinates 3 and 4 are those of the joints.
+        below = self.formation.n_contacts
+        holders = (rows if rows[0] < below else (rows[0] + 3,) for rows in self.holders)
+        return Modes(_list_pairs(self.formation), tuple(holders))
 
     def declares(self, holder: int) -> bool:
         """Whether the phase asks for what the `holder`-th force after c_n holds."""
@@ -398,13 +398,16 @@ class Rest:
         normals, bounds = self.held
         loss = x
         if np.isfinite(bounds).all():
-            loss = find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
+            reserves = -normals @ coefficients
+            reserves[:, 0] += bounds
+            loss = find_breach(reserves, x)
         least, every = 1e3 * _measure_drive(self.formation.scene), list(self.list_modes())
         margins = [mode.margins for mode in every]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
         # Where a margin changes sign; in between, no mode changes.
-        polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
+        polynomials = rows[:, 1:] @ coefficients
+        polynomials[:, 0] += rows[:, 0]
         starts, middles = _split(polynomials, x)
         torques = polyval(middles, coefficients.T)
         values = rows[:, :1] + rows[:, 1:] @ torques
@@ -449,11 +452,6 @@ def find_rest(formation: Formation, z: Array) -> Rest:
 def _measure_drive(scene: Scene) -> float:
     """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
     return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
-
-
-def _constant(values: Array, coefficients: Array) -> Array:
-    """Values, shape (m,), as polynomials of as many coefficients as those of a piece."""
-    return np.pad(values[:, None], ((0, 0), (0, coefficients.shape[1] - 1)))
 
 
 def _split(polynomials: Array, x: float) -> tuple[Array, Array]:

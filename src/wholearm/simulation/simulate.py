@@ -254,8 +254,7 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
     Xi = np.where(rolls, 0.0, slides)
     turns = np.sign(v + ahead * a) * (system.dry > 0)
-    stuck = tuple((pair,) for pair, one in zip(kept, rolls, strict=True) if one)
-    return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
+    return Modes(tuple(kept), (), tuple(Xi.tolist()), tuple(turns.tolist()))
 
 
 def _require_start(start: ArrayLike) -> Array:

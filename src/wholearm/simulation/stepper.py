@@ -17,7 +17,7 @@ edition, section II.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -81,9 +81,9 @@ class Modes(NamedTuple):
     """What keeps which contacts while a motion is smooth."""
 
     kept: tuple[int, ...] = ()  # pairs that press
-    # those of them that stick, each with what sticks as one
-    stuck: tuple[tuple[int, ...], ...] = ()
-    held: tuple[int, ...] = ()  # coordinates that dry friction holds
+    # what each force of friction holds, in rising order: rows of the kept pairs that stick as one,
+    # and below these, of a coordinate
+    holders: tuple[tuple[int, ...], ...] = ()
     Xi: tuple[float, ...] = ()  # sliding directions of the kept pairs, zero where they stick
     # directions of coordinates with dry friction, zero for those that are held
     sigma: tuple[float, ...] = ()
@@ -159,22 +159,20 @@ class ModeStepper:
         inputs.tolerance[:], inputs.lift[:] = tolerance, 1 / system.mass
         inputs.mu[:] = system.friction[list(self.modes.kept)]
         inputs.scales[:] = system.scales.force, system.scales.speed
-        slip = system.evaluate(z, z, [pairs[0] for pairs in self.modes.stuck]).slip
-        inputs.stay[:] = np.concatenate([slip, z[list(self.modes.held)]])
+        places = np.append(system.evaluate(z, z, self.modes.kept).slip, z)
+        inputs.stay[:] = places[[rows[0] for rows in self.modes.holders]]
 
 
 @lru_cache(maxsize=256)
 def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeStepper:
     """Steps of a set of modes without its signs, for torques of a polynomial degree."""
-    n, k, held = structure.n, len(modes.kept), list(modes.held)
-    groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
-    s = len(groups) + len(held)
+    n, k, s = structure.n, len(modes.kept), len(modes.holders)
     numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
     sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
     ends = np.cumsum([0, *sizes]).tolist()
     x = Inputs(*map(ca.SX.sym, Inputs._fields, sizes))._replace(geometry=structure.geometry)
     rows = EventRows(*(slice(*pair) for pair in pairwise(np.cumsum([0, k, 2 * s, k, n]).tolist())))
-    stage, report, project = _build_motion(structure, modes, groups, x)
+    stage, report, project = _build_motion(structure, modes, x)
     # One vector takes less time than many.
     packed = ca.MX.sym("inputs", ends[-1])
     at, stages = Inputs(*ca.vertsplit(packed, ends)), list[Expression]()
@@ -203,23 +201,25 @@ def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeSteppe
 
 
 def _build_motion(
-    structure: Structure, modes: Modes, groups: Sequence[Sequence[int]], x: Inputs
+    structure: Structure, modes: Modes, x: Inputs
 ) -> tuple[Expression, Expression, Callable[[Inputs, Expression], Expression]]:
-    """Equations of motion with inputs x; `groups` are the rows of what sticks among `modes.kept`.
+    """Equations of motion with inputs x.
 
     Two CasADi functions of z and z', the time and the inputs in one column: rates of the state and
     margins, then the outputs from the acceleration to the event values. A function of the inputs
     and (z, z'): its projection on the constraints, in the metric M.
     """
-    n, k, held, z = structure.n, len(modes.kept), list(modes.held), structure.z
+    n, k, z = structure.n, len(modes.kept), structure.z
     v, time, mu, lift = ca.SX.sym("v", n), ca.SX.sym("time"), x.mu, x.lift
     gap, slip, A, A_t, bend, bend_t = structure.build_rows(modes.kept, v)
-    slides, first = np.ones(k), [rows[0] for rows in groups]
+    first = [rows[0] for rows in modes.holders]
+    groups = [list(rows) for rows in modes.holders if rows[0] < k]
+    slides = np.ones(k)
     slides[[row for rows in groups for row in rows]] = 0.0
     rub = mu * x.Xi * ca.DM(slides)
-    hold = A_t[first, :], ca.DM(np.eye(n)[held].reshape(-1, n))
-    P, G = (ca.vertcat(part, *hold) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
-    curve = ca.vertcat(bend, *(bend_t[row] for row in first), ca.DM(len(held), 1))
+    hold = ca.vertcat(A_t, ca.DM(np.eye(n)))[first, :]
+    P, G = (ca.vertcat(part, hold) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
+    curve = ca.vertcat(bend, ca.vertcat(bend_t, ca.DM.zeros(n))[first])
     tau = _build_torque(time, x.piece, x.torque)
     viscous, dry = x.viscous * v, x.dry * x.sigma
     drive = ca.SX(n, 1)
@@ -232,9 +232,9 @@ def _build_motion(
     acceleration, v_t, (c_n, f) = lift * force, A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
     losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
     losses.append(ca.dot(rub * c_n, v_t))
-    bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups] + [x.dry[i] for i in held]
-    units = [x.scales[0]] * len(groups) + [x.friction_units[i] for i in held]
-    bound, unit = (ca.vertcat(ca.SX(0, 1), *part) for part in (bounds, units))
+    bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups]
+    bound = ca.vertcat(ca.SX(0, 1), *bounds, x.dry[[row - k for row in first[len(groups) :]]])
+    unit = ca.vertcat(ca.repmat(x.scales[0], k, 1), x.friction_units)[first]
     margins = ca.vertcat(c_n / x.scales[0], (bound - f) / unit, (bound + f) / unit)
     speeds = x.Xi * v_t / x.scales[1], x.sigma * v / x.units[n:]
     c_t = -rub * c_n
@@ -247,8 +247,7 @@ def _build_motion(
     )
     inputs = [ca.vertcat(z, v), time, ca.vertcat(*x)]
     stage, report = (ca.Function("of_state", inputs, list(map(ca.densify, r))) for r in results)
-    stays = ca.vertcat(ca.SX(0, 1), *(slip[row] for row in first), *(z[i] for i in held))
-    off = ca.vertcat(gap, stays - x.stay)
+    off = ca.vertcat(gap, ca.vertcat(slip, z)[first] - x.stay)
     constraints = ca.Function("rows", [z, x.stay, x.geometry], [ca.densify(P), ca.densify(off)])
 
     def project(at: Inputs, state: Expression) -> Expression:
