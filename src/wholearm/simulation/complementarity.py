@@ -33,8 +33,7 @@ from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
-from .stepper import Modes
-from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, System
+from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Modes, System
 
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts

@@ -5,7 +5,7 @@ joint with theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
-Vertices of a flush edge slide and stick as one, with one force T of friction (`stepper`), |T| <=
+Vertices of a flush edge slide and stick as one, with one force T of friction (`system`), |T| <=
 sum mu c_n. A contact flush with a rolling one has no friction of its own.
 
 **At rest.** Each choice of signs of sliding and turning, and of what sticks, makes accelerations
@@ -52,8 +52,7 @@ from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
-from .stepper import Modes
-from .system import ROUNDING_FORCE, STILL, ContactRows, build_system
+from .system import ROUNDING_FORCE, STILL, ContactRows, Modes, build_system
 
 _JOINTS = np.eye(5)[3:]  # rows that give the rates of the joints from z'
 

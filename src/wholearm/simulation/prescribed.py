@@ -46,9 +46,10 @@ from ..results.torque import TorqueProfile
 from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES
 from .system import (
     FIRST_STEP,
+    INNER_STAGES,
+    NODES,
     REACHED,
     REST_WINDOW,
     ROUNDING_FORCE,

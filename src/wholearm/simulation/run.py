@@ -14,8 +14,17 @@ from ..common.arrays import Array, Flags, find_root
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
-from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
-from .system import FIRST_STEP, SHORTEST_STEP, STANDING, System
+from .system import (
+    FIRST_STEP,
+    LOSSES,
+    ORDER,
+    SHORTEST_STEP,
+    STANDING,
+    Modes,
+    ModeStepper,
+    System,
+    build_stepper,
+)
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 

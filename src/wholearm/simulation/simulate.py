@@ -27,8 +27,7 @@ from ..results.trajectory import Trajectory
 from .events import Energies, EventKind, Outcome, OutcomeKind, Simulation, list_stretches
 from .prescribed import Replay
 from .run import Feedback, Law, Run
-from .stepper import Modes
-from .system import SLOW, build_system
+from .system import SLOW, Modes, build_system
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
