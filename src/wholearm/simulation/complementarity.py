@@ -295,20 +295,13 @@ class ClosedContacts:
 
     def pose(self, free: Array, rows: ContactRows) -> ContactProblem:
         """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
-        system, standing = self.system, self.standing
+        system, standing, none = self.system, self.standing, np.zeros(len(self.joints))
         G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ free + rows.bend
-        none = np.zeros(len(self.joints))
-        return ContactProblem(
-            1 / system.mass,
-            rows.A,
-            G,
-            b_n,
-            np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]]),
-            np.append(rows.A_t[standing] @ free + rows.bend_t[standing], free[self.joints]),
-            np.append(standing, none - 1).astype(int),
-            np.append(self.mu[standing], none),
-            np.append(np.zeros(len(standing)), system.dry[self.joints]),
-        )
+        T = np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]])
+        b_t = T @ free + np.append(rows.bend_t[standing], none)
+        owner, mu = np.append(standing, none - 1).astype(int), np.append(self.mu[standing], none)
+        bound = np.append(0 * self.mu[standing], system.dry[self.joints])
+        return ContactProblem(1 / system.mass, rows.A, G, b_n, T, b_t, owner, mu, bound)
 
     def recall(self, modes: Modes) -> list[int]:
         """Modes as `list_answers` has them."""
@@ -392,25 +385,22 @@ class FreeRun(Run):
             if not self.gets_on():
                 self.note(EventKind.GIVEN_UP, "decisions do not end")
                 return
-            if rests is None:
-                if not self._jolt():
-                    self.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
-                    if not self.records:
-                        self.record(still=True)
-                    return
-                continue
-            self.resting = rests
+            failure = "no motion obeys the laws of contact" if rests is None else ""
+            self.resting = self.resting if rests is None else rests
             if rests:
                 self.set_velocity(0.0)
                 self._hold()
-                continue
-            try:
-                self.move()
-            except StuckError:
-                # Forces grow without bound where the motion jams.
-                if not self._jolt():
-                    self.note(EventKind.GIVEN_UP, "steps become too short")
-                    return
+            elif not failure:
+                try:
+                    self.move()
+                except StuckError:
+                    # Forces grow without bound where the motion jams.
+                    failure = "steps become too short"
+            if failure and not self._jolt():
+                self.note(EventKind.GIVEN_UP, failure)
+                if not self.records:
+                    self.record(still=True)
+                return
 
     # Instants: impacts and modes.
 

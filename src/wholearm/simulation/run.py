@@ -66,7 +66,7 @@ class Run(ABC):
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
-        self.steps_at = [True, *self.find_torque_steps(torque).tolist()]
+        self.steps_at = [True, *self.find_torque_steps(torque.jumps).tolist()]
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
@@ -154,9 +154,9 @@ class Run(ABC):
         start, stop = self.breaks[self.piece : self.piece + 2]
         return (start + stop + x * (stop - start)) / 2
 
-    def find_torque_steps(self, torque: TorqueProfile) -> Flags:
-        """Whether torques step between successive pieces, shape (k - 1,)."""
-        return np.asarray(np.abs(torque.jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
+    def find_torque_steps(self, jumps: Array) -> Flags:
+        """Whether torques step, by their differences between pieces, shape (k, 2) [N m]."""
+        return np.asarray(np.abs(jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
 
     def set_velocity(self, v: Array | float) -> None:
         """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
@@ -211,9 +211,8 @@ class Run(ABC):
             forces = dict(zip(names, last.c_n.tolist(), strict=True))
         self.feedback.begin(self.piece, theta, theta_dot, forces)
         if self.piece:
-            first, (breaks, pieces) = self.piece - 1, (self.torque.breaks, self.torque.coefficients)
-            pair = TorqueProfile(breaks[first : first + 3], pieces[first : first + 2])
-            self.steps_at[self.piece] = bool(self.find_torque_steps(pair)[0])
+            held = self.torque.coefficients[self.piece - 1 : self.piece + 1, :, 0]
+            self.steps_at[self.piece] = bool(self.find_torque_steps(np.diff(held, axis=0))[0])
 
     def step_to(self, h: float) -> None:
         """Repeat the step with another length."""
