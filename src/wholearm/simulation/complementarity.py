@@ -482,9 +482,15 @@ class FreeRun(Run):
         if answer is None:
             raise ArithmeticError("the plastic impact has no solution")
         self.residual = max(self.residual, answer.residual)
-        v = self.v + answer.change
+        mass, v = self.system.mass, self.v + answer.change
         if bouncing and self.restitution:
-            v = self._expand(closed, answer, v)
+            # Poisson's expansion, unless it would gain energy.
+            impulse = self.restitution * answer.c_n
+            pushed = v + closed.rows.A.T @ impulse / mass
+            problem = closed.pose_impact(pushed)
+            expands = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
+            after = v if expands is None else pushed + expands.change
+            v = after if after**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
         pause = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
             if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
@@ -498,15 +504,6 @@ class FreeRun(Run):
             if bouncing or all(self.t - e.time >= pause for e in told):
                 self.note(kind, note, name, float(-rates[k]))
         self.set_velocity(v)
-
-    def _expand(self, closed: ClosedContacts, plastic: ContactAnswer, v: Array) -> Array:
-        """Velocity after expansion with Poisson's restitution; `v` where that would gain energy."""
-        mass, impulse = self.system.mass, self.restitution * plastic.c_n
-        pushed = v + closed.rows.A.T @ impulse / mass
-        problem = closed.pose_impact(pushed)
-        answer = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
-        after = v if answer is None else np.asarray(pushed + answer.change)
-        return after if after**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
 
     def _jolt(self) -> bool:
         """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
@@ -734,10 +731,6 @@ class FreeRun(Run):
         motion = motion.reshape(3, self.system.n)
         self.after = StepEnd(motion, *self.system.look(motion[0]))
         return np.concatenate([out.values, self.after.ranges[self.kept] / self.unit])
-
-    def handle(self, found: list[int]) -> bool:
-        """End the motion at an event."""
-        return True
 
     def pass_break(self) -> bool | None:
         """Go on to the next piece of the torques; the motion ends if they end or modes change."""

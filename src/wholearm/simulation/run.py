@@ -119,9 +119,9 @@ class Run(ABC):
         """
         return None
 
-    @abstractmethod
     def handle(self, found: list[int]) -> Any:
-        """How events end the motion; None if it goes on."""
+        """How events, by their rows, end the motion; None if it goes on."""
+        return True
 
     @abstractmethod
     def pass_break(self) -> Any:

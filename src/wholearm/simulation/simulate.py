@@ -102,7 +102,14 @@ def simulate(
         require_phases(problem)
         run = Replay(problem, profile, tolerance, wanted, minima)
         return _conclude(run, problem, *run.play(progress))
-    state = _require_start(problem.start if start is None else start)
+    try:
+        state = np.asarray(problem.start if start is None else start, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("", "start", "does not hold numbers") from None
+    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+        text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
+        raise InputError("", "start", text)
+    state = np.concatenate([state, np.zeros(10 - len(state))])
     if require_number(restitution, "restitution", nonnegative=True) > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     end = None if until is None else require_number(until, "until", positive=True)
@@ -254,14 +261,3 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     Xi = np.where(rolls, 0.0, slides)
     turns = np.sign(v + ahead * a) * (system.dry > 0)
     return Modes(tuple(kept), (), tuple(Xi.tolist()), tuple(turns.tolist()))
-
-
-def _require_start(start: ArrayLike) -> Array:
-    try:
-        state = np.asarray(start, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("", "start", "does not hold numbers") from None
-    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
-        text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
-        raise InputError("", "start", text)
-    return np.concatenate([state, np.zeros(10 - len(state))])
