@@ -74,14 +74,6 @@ class ContactProblem:
         K = (lifted @ pushes.T) * (units[:, None] * units)
         return units[:k], units[k:], K, units * np.concatenate([self.b_n, self.b_t])
 
-    @cached_property
-    def is_unique(self) -> bool:
-        """Whether there is surely one solution: nothing may stick, K + K^T is positive definite."""
-        if len(self.b_t):
-            return False
-        K = self.scaled[2]
-        return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
-
     def describe(self, answer: ContactAnswer) -> list[int]:
         """Modes of an answer as `list_answers` has them."""
         choice = [STICKS if c > 0 else APART for c in answer.c_n]
@@ -580,7 +572,10 @@ class FreeRun(Run):
         earlier.
         """
         last = closed.recall(self.modes)
-        self.unique = problem.is_unique
+        # There is surely one solution if nothing may stick and K + K^T is positive definite.
+        K = problem.scaled[2]
+        slides = not len(problem.b_t)
+        self.unique = slides and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > SINGULAR)
         answers = [] if self.unique else list_answers(problem)
         if len(answers) > 1:
             modes = [problem.describe(answer) for answer in answers]
@@ -757,37 +752,33 @@ class FreeRun(Run):
         return bool((self.values > clear).all()) and not touches.any()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
-        """The first pair that closes within the step just made, but those `done`, and when."""
-        passed = [pair for pair in done if pair >= 0]
+        """The first pair that closes within the step just made, but those `done`, and when.
+
+        Pairs that do not face each other there do not count.
+        """
+        n, passed = self.system.n, [pair for pair in done if pair >= 0]
         while bracket := self._find_bracket(h, passed):
-            if (root := self._find_contact(h, *bracket)) is not None:
-                return bracket[0], root
-            passed.append(bracket[0])
+            pair, level, left, right = bracket
+
+            def value(step: float, pair: int = pair, level: float = level) -> float:
+                self.step_to(step)
+                return float(self.after.gaps[pair]) - level
+
+            first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
+            last = value(right)
+            if last >= 0 and right < h:
+                # The bracket is that of an interpolation, which grazing may mislead.
+                right, last = h, value(h)
+            if last < 0:
+                # Some ten roundings of the gap count as closed.
+                root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
+                self.step_to(root)
+                y = self.s.outputs.y
+                if self._face(y[:n], y[n : 2 * n])[1][pair]:
+                    return pair, root
+            passed.append(pair)
             self.step_to(h)
         return None
-
-    def _find_contact(
-        self, h: float, pair: int, level: float, left: float, right: float
-    ) -> float | None:
-        """When a pair closes within a step; None if it does not, or where the two do not face."""
-        n = self.system.n
-
-        def value(step: float) -> float:
-            self.step_to(step)
-            return float(self.after.gaps[pair]) - level
-
-        first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
-        last = value(right)
-        if last >= 0 and right < h:
-            # The bracket is that of an interpolation, which grazing may mislead.
-            right, last = h, value(h)
-        if last >= 0:
-            return None
-        # Some ten roundings of the gap count as closed.
-        root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
-        self.step_to(root)
-        y = self.s.outputs.y
-        return root if self._face(y[:n], y[n : 2 * n])[1][pair] else None
 
     def _find_bracket(
         self, h: float, passed: Sequence[int]

@@ -48,7 +48,6 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import close_all, find_freedoms, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
-from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
@@ -422,7 +421,8 @@ class Rest:
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
-        tau = polyval(np.asarray(x), coefficients.T)
+        tau, rolls = polyval(np.asarray(x), coefficients.T), self.formation.n_rolling
+        count = self.formation.n_contacts
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.list_modes() if mode.slides(tau)]
@@ -430,8 +430,12 @@ class Rest:
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
-            row, least, c_t = find_weakest(self.formation, weakest)
-            return Collapse(x, self.formation.names[row], least, jams, c_t)
+            normal, *cones = np.split(weakest, np.cumsum([count, rolls]))
+            row, c_t = int(normal.argmin()), None
+            if normal[row] >= 0 and rolls:
+                k = int(np.minimum(*cones).argmin())
+                row, c_t = self.formation.rolling_rows[k], float(cones[1][k] - cones[0][k]) / 2
+            return Collapse(x, self.formation.names[row], float(normal[row]), jams, c_t)
         row = int(pulls.argmax())
         return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
 

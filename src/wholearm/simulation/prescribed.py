@@ -307,12 +307,15 @@ class Replay(Run):
         text = f"{goal} is reached at t = {self.t:.5g} s, the end of phase {len(phases)}"
         return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
 
-    def _arrive(self, window: float, stepped: bool = False) -> Ending:
+    def _arrive(self, window: float | None = None, stepped: bool = False) -> Ending:
         """End the phase; if it ends at rest the motion stops, with a plastic impact if need be.
 
         If the next step of the torques, or their end, comes within the `window` [s], or before the
         motion was to end, the arrival belongs to it; the latter not if they have just `stepped`.
+        While moving the window is short.
         """
+        if window is None:
+            window = self.settling if abs(self._measure_rate()) < SLOW else 0.0
         until, following = self.phase.until, self.following
         self.note(EventKind.ARRIVAL, f"{until} reached", str(until), -self.rate)
         if self._strikes() and following is not None:
@@ -490,7 +493,7 @@ class Replay(Run):
     def handle(self, kinds: Sequence[int]) -> Ending | None:
         """End the motion at events, or go on."""
         if len(self.slack) - 2 in kinds:
-            return self._reach()
+            return self._arrive()
         if len(self.slack) - 1 in kinds:
             return self.come_to_rest()
         pulling = [k for k in kinds if k < self.s.rows.force.stop]
@@ -507,12 +510,8 @@ class Replay(Run):
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
             # Phase 1 of scene 584 of seed 1128 turns 5 nm before its end, for the least time.
-            return self._reach()
+            return self._arrive()
         return self.restart(turning)
-
-    def _reach(self) -> Ending:
-        """The end of the phase is reached while moving."""
-        return self._arrive(self.settling if abs(self._measure_rate()) < SLOW else 0.0)
 
     def _find_remaining(self) -> float:
         """Time until the torques to come slow the motion no more, or have stopped it [s].

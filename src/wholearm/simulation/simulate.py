@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -131,39 +131,27 @@ def simulate_free(problem: Problem, what: Torques | Law, **options: Any) -> Simu
     return simulate(problem, what, contacts="free", **options)
 
 
-@exclusive
 def simulate_phases(
     problem: Problem,
     plan: Trajectory,
-    *,
     progress: Callable[[str], None] | None = None,
     **options: float,
-) -> list[tuple[range, Simulation]]:
-    """Simulate the phases of a plan one by one, each from its planned start, with free contacts.
+) -> Iterator[tuple[range, Simulation]]:
+    """Indices and simulations of a plan's phases, each from its planned start, with free contacts.
 
     Phases that pass into one another in motion, by the plan's velocities, are simulated together.
-    Returns indices of phases with each simulation.
-
-    Parameters
-    ----------
-    progress  told which phase is simulated
-    options   restitution and tolerance, as of `simulate`
+    `options` are restitution and tolerance, as of `simulate`.
     """
-    starts, simulations = plan.phase_starts, []
+    starts, system = plan.phase_starts, build_system(problem.scene)
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
-    system = build_system(problem.scene)
     rests = [row for row in range(1, len(rows)) if system.is_slower(plan.z_dot[rows[row]], SLOW)]
     for first, stop in pairwise([0, *rests, len(rows)]):
         if progress is not None:
             progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
         profile = plan.torque.cut(float(starts[first]), float(starts[stop]))
-        row = rows[first]
-        state = np.concatenate([plan.z[row], plan.z_dot[row]])
-        hint = _recall(problem, plan, row)
-        clock = starts[first:stop].tolist()
-        simulation = _simulate(problem, profile, state, clock, hint, None, **options)
-        simulations.append((range(first, stop), simulation))
-    return simulations
+        row, clock = rows[first], starts[first:stop].tolist()
+        state, hint = np.append(plan.z[row], plan.z_dot[row]), _recall(problem, plan, row)
+        yield range(first, stop), _simulate(problem, profile, state, clock, hint, None, **options)
 
 
 def _simulate(

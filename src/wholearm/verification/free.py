@@ -80,7 +80,7 @@ def verify_free(
         phases, failures = _follow(whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
-    for indices, part in simulate_phases(problem, plan, progress=progress, **options):
+    for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
         warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
@@ -174,13 +174,13 @@ def find_policy(
     for speed in CONTACT_SPEEDS if contact_speed is None else (contact_speed,):
         policy = make_policy(problem, plan, contact_speed=speed, **values)
         report = verify_policy(problem, plan, policy, departure=departure)
-        if usual is not None and report.ok:
+        if report.ok and usual is not None:
             text = f"contacts are made at {speed:g} times the usual speed: otherwise "
             warnings = (*report.warnings, text + "; ".join(usual[1].failures))
-            report = replace(report, warnings=warnings)
-        if report.ok:
-            return policy, report
+            return policy, replace(report, warnings=warnings)
         usual = usual or (policy, report)
+        if report.ok:
+            return usual
     assert usual is not None
     return usual
 

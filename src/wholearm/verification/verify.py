@@ -20,7 +20,7 @@ from ..geometry.curve import describe_pose
 from ..geometry.tracing import EndDistance
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows
-from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
+from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem
@@ -251,8 +251,10 @@ def _report_phase(
     pressing = _find_least(simulation, index, forces, EventKind.CONTACT_LOST)
     columns = [simulation.contacts.index(name) for name in formation.names]
     c_n, c_t = (c[rows][:, columns] for c in (simulation.c_n, simulation.c_t))
-    names = [formation.names[row] for row in formation.rolling_rows]
-    margins = dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
+    margins = {
+        formation.names[row]: formation.friction[row] * c_n[:, row] - np.abs(c_t[:, row])
+        for row in formation.rolling_rows
+    }
     slips = _find_least(simulation, index, margins, EventKind.SLIP)
     end = worst = held = least = None
     if uniqueness:
@@ -735,9 +737,9 @@ def _examine_loss(
             )
             for name, c_n, c_t in zip(formation.names, response.c, response.c_t, strict=False)
         )
-    if response is not None and distance is not None:
-        slope = -distance[1][0] @ response.acceleration
-        closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
+        if distance is not None:
+            slope = -distance[1][0] @ response.acceleration
+            closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
     when = float(simulation.t[row])
     return results.Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
