@@ -235,6 +235,7 @@ _RATE = Range(
     1e-4, 1e9, lambda scene, f: f.torque_limit / scene.scales.time, "torque limits in {time}"
 )
 _LAG = relate_time(0.0, 1e2, "x {time}")
+_VISCOUS_TEXT = "Viscous friction of the joint [N m s]."
 _RATE_TEXT = "How quickly the torque may change [N m/s]; none by default: it may step."
 _LAG_TEXT = "Time constant with which the torque follows its command [s]."
 
@@ -244,14 +245,7 @@ _LAG_TEXT = "Time constant with which the torque follows its command [s]."
     key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", _LENGTH),
     key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", _RADIUS, default=0.0),
     key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", _INERTIA),
-    key(
-        "viscous",
-        "Viscous friction of the joint [N m s].",
-        NONNEGATIVE,
-        "drag",
-        _VISCOUS,
-        default=0.0,
-    ),
+    key("viscous", _VISCOUS_TEXT, NONNEGATIVE, "drag", _VISCOUS, default=0.0),
     key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", _DRY, default=0.0),
     key("torque_limit", "[N m]", POSITIVE, "torque", _TORQUE, _STRENGTH),
     key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", _SPEED),
@@ -337,23 +331,19 @@ class Scales(NamedTuple):
         return Scales(length, mass, force, *motion, *others)
 
 
+_PERIOD = relate_time(1e-3, 1e2, "times the scene's time")
+_COLLIDE_TEXT = "Whether the links stop each other; false where they move in different planes."
+_PERIOD_TEXT = "Period over which torques are held; with 0 they are free [s]."
+_HOLD_TEXT = (
+    "Whether torques are constant over each period, or lines that go on from period to period."
+)
+
+
 @declare(
     key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", Range(1e-3, 1e5)),
-    key(
-        "fingers_collide",
-        "Whether the links stop each other; false where they move in different planes.",
-        BOOLEAN,
-    ),
-    key(
-        "control_period",
-        "Period over which torques are held; with 0 they are free [s].",
-        *(NONNEGATIVE, "time", relate_time(1e-3, 1e2, "times the scene's time")),
-    ),
-    key(
-        "control_hold",
-        "Whether torques are constant over each period, or lines that go on from period to period.",
-        choice(*HOLDS),
-    ),
+    key("fingers_collide", _COLLIDE_TEXT, BOOLEAN),
+    key("control_period", _PERIOD_TEXT, NONNEGATIVE, "time", _PERIOD),
+    key("control_hold", _HOLD_TEXT, choice(*HOLDS)),
 )
 @dataclass(frozen=True, eq=False)
 class Scene:

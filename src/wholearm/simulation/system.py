@@ -176,16 +176,9 @@ def build_system(scene: Scene) -> System:
     parts = {"m": scene.friction.palm, "1": scene.friction.finger1, "2": scene.friction.finger2}
     names = (pair.name for pair in structure.pairs)
     friction = [0.0 if name[0] in "tj" else parts[name[-1]] for name in names]
-    return System(
-        structure,
-        np.concatenate([scene.polygon.vertices.ravel(), *links]),
-        scene.mass_diagonal,
-        scene.applied_force,
-        scene.viscous,
-        scene.dry,
-        np.array(friction),
-        scene.scales,
-    )
+    geometry = np.concatenate([scene.polygon.vertices.ravel(), *links])
+    numbers = scene.mass_diagonal, scene.applied_force, scene.viscous, scene.dry
+    return System(structure, geometry, *numbers, np.array(friction), scene.scales)
 
 
 @lru_cache(maxsize=16)
