@@ -365,7 +365,15 @@ class FreeRun(Run):
 
         `touching` are gaps to close at the start [m].
         """
-        self._close(touching)
+        system, root = self.system, np.sqrt(self.system.mass)
+        for _ in range(5):
+            # Project onto what touches, in the metric of masses.
+            gaps, ranges = system.look(self.z)
+            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
+            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
+                break
+            rows = system.evaluate(self.z, self.v, near).A / root
+            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
         while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
             if self.t >= self.stop:
                 self.next_piece()
@@ -414,18 +422,6 @@ class FreeRun(Run):
 
     def _is_still(self, acceleration: Array) -> bool:
         return self.system.is_slower(acceleration * self.system.scales.time, STILL)
-
-    def _close(self, touching: float) -> None:
-        """Project the start onto what touches, in the metric of masses."""
-        system = self.system
-        root = np.sqrt(system.mass)
-        for _ in range(5):
-            gaps, ranges = system.look(self.z)
-            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
-            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
-                break
-            rows = system.evaluate(self.z, self.v, near).A / root
-            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
 
     def _face(self, z: Array, v: Array) -> tuple[Array, Flags]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
@@ -706,7 +702,14 @@ class FreeRun(Run):
         self.level = np.where(gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
         self.shift = np.maximum(self.slack, self.slack - self.values)
-        self.h = min(self.h, self._time_to_return())
+        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
+        if near.any():
+            # Half the time in which the nearest pair that has just parted would close again. What
+            # parts more slowly was closed when the modes were chosen.
+            at = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
+            rate, bend = at.A @ self.v, at.A @ self.s.outputs.acceleration + at.bend
+            back = (rate >= self.chatter) & (bend < 0)
+            self.h = float((-rate[back] / bend[back]).min(initial=self.h))
         self.record()
         super().move()
 
@@ -829,19 +832,6 @@ class FreeRun(Run):
                 return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
             self.step_to(h)
         return None
-
-    def _time_to_return(self) -> float:
-        """Half the time in which the nearest pair that has just parted would close again [s]."""
-        gaps = self.after.gaps
-        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
-        if not near.any():
-            return math.inf
-        rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
-        rate = rows.A @ self.v
-        bend = rows.A @ self.s.outputs.acceleration + rows.bend
-        # What parts more slowly was closed when the modes were chosen.
-        back = (rate >= self.chatter) & (bend < 0)
-        return float((-rate[back] / bend[back]).min(initial=np.inf))
 
 
 def _name(system: System, joint: int) -> str:
