@@ -32,7 +32,6 @@ from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation import modes
 from ..simulation.events import EventKind, Simulation
-from ..simulation.simulate import simulate
 from ..simulation.system import SETTLING
 
 if TYPE_CHECKING:
@@ -146,6 +145,8 @@ def observe(
     With a `plan` that is where it has rows, to compare it with. JammingError, SimulationError if
     the simulation cannot go on.
     """
+    from ..simulation.simulate import simulate  # not needed without a replay
+
     if plan is None:
         times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
     else:
