@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+DEPARTURE = 1e-3  # largest `Deviation` from a plan, over the scene's length, and in rad
 ROLLS = "rolls"  # mode of a contact that rolls; one that slides has the sign of its direction
 
 

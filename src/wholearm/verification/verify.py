@@ -26,7 +26,7 @@ from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_
 from ..problem.definition import End, Phase, Problem
 from ..results import report as results
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
-from ..results.plan_record import Deviation
+from ..results.plan_record import DEPARTURE, Deviation
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
@@ -37,8 +37,6 @@ from ..simulation.system import SETTLING
 if TYPE_CHECKING:
     from .free import FreeReport
 
-DEPARTURE = 1e-3
-"""Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
 STRAY = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
 EXACT_REST = 1e-9  # speed of rest but for rounding, relative to the scene's speed
