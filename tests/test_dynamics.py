@@ -35,8 +35,7 @@ from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation import complementarity
-from wholearm.verification.verdict import find_uniqueness_margin, find_wedged
-from wholearm.verification.verify import reduce_to_first_joint
+from wholearm.verification.verify import find_uniqueness_margin, find_wedged, reduce_to_first_joint
 
 State = tuple[Formation, Array, Array, Directions]
 """A formation, a configuration and a velocity that keep its contacts, and the signs of sliding."""

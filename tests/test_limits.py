@@ -170,8 +170,8 @@ def test_a_contact_that_begins_to_slide_is_inside_its_cone_until_then() -> None:
     (plan,) = plan_phases(problem, problem.phases[1:2], start, COARSE)
     part = plan.motion.stages[-1]
     assert isinstance(part, StageMotion)
-    (row,), last = part.formation.rolling_rows, part.breaks[-2:].tolist()
-    samples = part.evaluate(np.linspace(*last, 2001))
+    (row,), breaks = part.formation.rolling_rows, part.breaks
+    samples = part.evaluate(np.linspace(breaks[-2], breaks[-1], 2001))
     used = np.abs(samples.c_t[:, row]) / samples.c_n[:, row]
     least = 0.9 * float(used.max())
     weak = problem.with_(friction_palm=least, torque_rate_limit=1e4)

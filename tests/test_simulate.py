@@ -38,7 +38,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
-from wholearm.simulation import stepper
+from wholearm.simulation import system
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.modes import Collapse, find_rest
 from wholearm.simulation.prescribed import Replay
@@ -333,7 +333,7 @@ def test_order_on_a_known_solution() -> None:
         assert state.shape == (2, 1)
         return ca.vertcat(state[1], -state[0], state[0] * state[1]) * ca.cos(time)
 
-    step = ca.Function("step", [y, t, h], [stepper.build_step(rate, y, t, h, 2)[0]])
+    step = ca.Function("step", [y, t, h], [system.build_step(rate, y, t, h, 2)[0]])
     errors = []
     for count in (8, 16):
         state = np.array([0.0, 1.0, 0.0])
@@ -346,9 +346,9 @@ def test_order_on_a_known_solution() -> None:
 
 def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    end, fifth, third = stepper.build_step(lambda s, _: -s, y, t, h, 1)
+    end, fifth, third = system.build_step(lambda s, _: -s, y, t, h, 1)
     tolerance = 1e-6
-    error = stepper.build_error(fifth, third, y, 1.0, tolerance)
+    error = system.build_error(fifth, third, y, 1.0, tolerance)
     step = ca.Function("step", [y, t, h], [end, error])
     for length in (0.2, 0.5, 1.0):
         state, estimate = (float(value) for value in step(1.0, 0.0, length))

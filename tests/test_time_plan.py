@@ -50,8 +50,9 @@ from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
+from wholearm.results.report import DEPARTURE
 from wholearm.results.trajectory import Samples
-from wholearm.verification.verdict import DEPARTURE, Allowance, describe_failures
+from wholearm.verification.verify import Allowance, describe_failures
 
 SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""

@@ -29,8 +29,7 @@ from wholearm.planning.plan import solve
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import Balance, balance
-from wholearm.verification.verdict import STRAY, Allowance, measure_stray
-from wholearm.verification.verify import list_normal_forces, verify
+from wholearm.verification.verify import STRAY, Allowance, list_normal_forces, measure_stray, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 

@@ -22,13 +22,13 @@ from ..common.sharing import exclusive
 from ..geometry.tracing import EndDistance
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
+from ..results.report import DEPARTURE
 from ..results.torque import TorqueProfile, format_rows
 from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW
 from ..verification import free
-from ..verification.verdict import DEPARTURE
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
 FACTOR = 1.1

@@ -41,7 +41,7 @@ from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
-from ..simulation.stepper import NODES
+from ..simulation.system import NODES
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
 from .stress import BASE, OBJECTIVES, STRANGE, change_tree, damage_torques

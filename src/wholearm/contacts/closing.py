@@ -76,12 +76,10 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
 
 def close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
-    cuts = range(0, max(len(x), 1), CHUNK)
-    parts = [_close_fingers(scene, x[k : k + CHUNK], phi[k : k + CHUNK]) for k in cuts]
-    return ClosedFinger(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-
-def _close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
+    if len(x) > CHUNK:
+        cuts = (slice(k, k + CHUNK) for k in range(0, len(x), CHUNK))
+        parts = [close_fingers(scene, x[cut], phi[cut]) for cut in cuts]
+        return ClosedFinger(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     y, _ = lower(scene, phi)
     z = np.column_stack([x, y, phi, np.empty((len(x), 2))])
     touched = np.empty((len(x), 2), dtype=np.int64)

@@ -234,10 +234,9 @@ def close_all(
     """
     metric = metric_weights(formation.scene) if metric is None else metric
     rho = formation.scene.scales.length
-    sizes = np.full(formation.n_constraints, rho)
     steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
-    sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
-    sizes = np.append(sizes, np.full(len(active), rho))
+    units = [rho if row < 2 else 1.0 for row, _ in fixed]
+    sizes = np.array([rho] * formation.n_constraints + units + [rho] * len(active))
     solutions, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
     for _ in range(50):
         kinematics = formation.evaluate(z, np.zeros(z.shape))

@@ -85,56 +85,52 @@ class Impact:
 
 def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
     """Plastic impact of a velocity `v` at `z`, (5,) each, between closed formations."""
-    kinematics = after.evaluate(z[None], v[None])
+    kinematics, mass = after.evaluate(z[None], v[None]), after.scene.mass_diagonal
     P, A_t = kinematics.P[0], kinematics.A_t[0]
     slides = np.ones(after.n_contacts)
     slides[list(after.rolling_rows)] = 0.0
+    rolls = [after.names[row] for row in after.rolling_rows]
 
-    def directions(velocity: Array) -> tuple[float, ...]:
+    def find_sliding(velocity: Array) -> tuple[float, ...]:
         return tuple(slides * np.where(A_t @ velocity < 0, -1.0, 1.0))
 
+    def strike(Xi: Array) -> Impact:
+        """The impact with given sliding directions."""
+        directions = Directions(Xi, np.ones(2))
+        ratio = float(reduced_inertia(after, kinematics, directions)[0])
+        if not ratio > 0:
+            jam = ImpactViolation(ViolationKind.JAM, " ".join(after.names), ratio)
+            return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
+        v_after, p = solve_impulses(mass, P, force_rows(after, kinematics, directions)[0], v)
+        speed = measure_speed(after.scene, v)
+        momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
+        normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
+        values = (
+            (ViolationKind.HELD, speed, after.names, Xi * (A_t @ v_after)),
+            (ViolationKind.PULL, momentum, after.names, normal),
+            (ViolationKind.SLIP, momentum, [*rolls, *rolls], cones),
+            (ViolationKind.CLOSING, speed, *_rates(before, after, z, v_after)),
+        )
+        violations = [
+            ImpactViolation(kind, names[k], float(amounts[k]))
+            for kind, unit, names, amounts in values
+            for k in np.argsort(amounts)
+            if amounts[k] < -ROUNDING * unit
+        ]
+        return Impact(after, v_after, p, Xi, tuple(violations))
+
     # Try the sliding of the frictionless impact, then that of each answer; rarely any other.
-    likely = directions(solve_impulses(after.scene.mass_diagonal, P, P, v)[0])
+    likely = find_sliding(solve_impulses(mass, P, P, v)[0])
     others = product(*((1.0, -1.0) if one else (0.0,) for one in slides))
     tried: dict[tuple[float, ...], Impact] = {}
     for choice in (likely, *others):
         Xi = choice
         while Xi not in tried:
-            tried[Xi] = impact = _compute_impact(before, after, z, v, np.array(Xi))
+            tried[Xi] = impact = strike(np.array(Xi))
             if not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}:
                 return impact
-            Xi = directions(impact.v)
+            Xi = find_sliding(impact.v)
     return tried[likely]
-
-
-def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
-    """Plastic impact of a velocity onto a formation with given sliding directions."""
-    kinematics = after.evaluate(z[None], v[None])
-    P, mass = kinematics.P[0], after.scene.mass_diagonal
-    directions = Directions(Xi, np.ones(2))
-    ratio = float(reduced_inertia(after, kinematics, directions)[0])
-    if not ratio > 0:
-        jam = ImpactViolation(ViolationKind.JAM, " ".join(after.names), ratio)
-        return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
-    v_after, p = solve_impulses(mass, P, force_rows(after, kinematics, directions)[0], v)
-    speed = measure_speed(after.scene, v)
-    momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
-    rolls = [after.names[row] for row in after.rolling_rows]
-    normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
-    along = Xi * (kinematics.A_t[0] @ v_after)
-    values = (
-        (ViolationKind.HELD, speed, after.names, along),
-        (ViolationKind.PULL, momentum, after.names, normal),
-        (ViolationKind.SLIP, momentum, [*rolls, *rolls], cones),
-        (ViolationKind.CLOSING, speed, *_rates(before, after, z, v_after)),
-    )
-    violations = [
-        ImpactViolation(kind, names[k], float(amounts[k]))
-        for kind, unit, names, amounts in values
-        for k in np.argsort(amounts)
-        if amounts[k] < -ROUNDING * unit
-    ]
-    return Impact(after, v_after, p, Xi, tuple(violations))
 
 
 def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:

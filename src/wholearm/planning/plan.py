@@ -27,7 +27,7 @@ from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import require_phases
 from ..results.report import Certificate, RangeFigures, TimeBound, Transition, UniquenessMargin
 from ..results.trajectory import Trajectory
-from ..verification.verdict import EXACT_REST, find_uniqueness_margin, find_wedged
+from ..verification.verify import EXACT_REST, find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .nlp import Ledger, charge, open_ledger

@@ -22,8 +22,7 @@ from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, samp
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
-from ..verification.verdict import Allowance, measure_departure
-from ..verification.verify import describe_motors, find_commands, judge, observe
+from ..verification.verify import Allowance, describe_motors, find_commands, judge, observe
 from .blocks import BlockPlan, Planning, plan_each
 
 SPARE = 2.0  # additional normal force over a small shortfall
@@ -68,7 +67,7 @@ class ReplayCheck(NamedTuple):
         for phase in self.report.phases if isinstance(self.report, Report) else ():
             departs = (
                 phase.deviation is not None
-                and measure_departure(phase.deviation, scales.length) > allowance.departure
+                and phase.deviation.measure(scales.length) > allowance.departure
             )
             speed = phase.end_speed or 0.0
             carried = speed * following.get(phase.number, 0.0)

@@ -14,6 +14,8 @@ from ..common.document import Document, Result, Table, fixed
 from .adopt import Moved
 from .trajectory import Trajectory
 
+DEPARTURE = 1e-3  # largest `Deviation` from a plan, over the scene's length, and in rad
+
 
 class Deviation(NamedTuple):
     """Largest difference between planned and simulated state."""
@@ -21,6 +23,11 @@ class Deviation(NamedTuple):
     position: float  # [m]: of the coordinates x and y
     angle: float  # [rad]: of phi and the joint angles
     time: float  # [s]: when the larger of the two was, positions counting over the scene's length
+
+    def measure(self, length: float) -> float:
+        """Its size, over the scene's `length` [m] and in rad; zero where none is known."""
+        sizes = self.position / length, self.angle
+        return max((size for size in sizes if not math.isnan(size)), default=0.0)
 
 
 class ForceAt(NamedTuple):

@@ -141,7 +141,18 @@ class Polygon:
     def __post_init__(self) -> None:
         read_keys(self, "object.")
         corners = np.asarray(self.points)
-        size = _check_size(corners)
+        least, largest, far = 1e-4, 1e3, float(np.abs(corners).max())
+        if far > 1e3 * largest:
+            corner = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
+            text = f"{corner} given; allowed are coordinates up to {1e3 * largest:g} m"
+            raise InputError("", "object.vertices", text)
+        size = float(np.hypot(*(corners[:, None] - corners).transpose(2, 0, 1)).max())
+        if not least <= size <= largest:
+            text = f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
+            raise InputError("", "object.vertices", text)
+        if far > 1e3 * size:
+            text = f"allowed are {1e3 * size:.3g} m, 1000 times the polygon's size"
+            raise InputError("", "object.vertices", f"{far:.3g} m from the origin; {text}")
         edges = np.roll(corners, -1, axis=0) - corners
         # About a corner: far from the origin, areas would lose their digits.
         local = corners - corners[0]
@@ -158,7 +169,19 @@ class Polygon:
             text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
             key = f"object.vertices[{reflex[0]}]"
             raise InputError("", key, f"{text}every corner must turn left")
-        _check_shape(corners, edges, size)
+        shortest, slender, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
+        k = int(lengths.argmin())
+        if lengths[k] < shortest * size:
+            text = (
+                f"allowed are {shortest * size:.3g} m and more, {shortest:g} of the polygon's size"
+            )
+            text = f"the edge from there has {lengths[k]:.3g} m; {text}"
+            raise InputError("", f"object.vertices[{k}]", text)
+        away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
+        width = float(away.max(axis=1).min())
+        if width < slender * size:
+            text = f"allowed are {slender * size:.3g} m and more, {slender:g} of its size"
+            raise InputError("", "object.vertices", f"the polygon is {width:.3g} m wide; {text}")
         if headings.sum() > 2 * np.pi + 1e-6:
             raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
         middle = ((local + np.roll(local, -1, axis=0)) * cross[:, None]).sum(axis=0) / (6 * area)
@@ -189,39 +212,6 @@ class Polygon:
         return -math.atan2(run[1], run[0])
 
 
-def _check_size(corners: Array) -> float:
-    """Largest distance between two corners [m], if it and the corners are within limits."""
-    least, largest, far = 1e-4, 1e3, float(np.abs(corners).max())
-    if far > 1e3 * largest:
-        corner = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
-        text = f"{corner} given; allowed are coordinates up to {1e3 * largest:g} m"
-        raise InputError("", "object.vertices", text)
-    size = float(np.hypot(*(corners[:, None] - corners).transpose(2, 0, 1)).max())
-    if not least <= size <= largest:
-        text = f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
-        raise InputError("", "object.vertices", text)
-    if far > 1e3 * size:
-        text = f"allowed are {1e3 * size:.3g} m, 1000 times the polygon's size"
-        raise InputError("", "object.vertices", f"{far:.3g} m from the origin; {text}")
-    return size
-
-
-def _check_shape(corners: Array, edges: Array, size: float) -> None:
-    """Check that a convex polygon is not too slender, and that it has no too short edge."""
-    shortest, slender, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
-    k = int(lengths.argmin())
-    if lengths[k] < shortest * size:
-        text = f"allowed are {shortest * size:.3g} m and more, {shortest:g} of the polygon's size"
-        raise InputError(
-            "", f"object.vertices[{k}]", f"the edge from there has {lengths[k]:.3g} m; {text}"
-        )
-    away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
-    width = float(away.max(axis=1).min())
-    if width < slender * size:
-        text = f"allowed are {slender * size:.3g} m and more, {slender:g} of its size"
-        raise InputError("", "object.vertices", f"the polygon is {width:.3g} m wide; {text}")
-
-
 def cross_product(a: Array, b: Array) -> Array:
     """Plane cross product a_x b_y - a_y b_x along the last axis."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
@@ -245,6 +235,7 @@ _RATE = Range(
     1e-4, 1e9, lambda scene, f: f.torque_limit / scene.scales.time, "torque limits in {time}"
 )
 _LAG = relate_time(0.0, 1e2, "x {time}")
+_VISCOUS_TEXT = "Viscous friction of the joint [N m s]."
 _RATE_TEXT = "How quickly the torque may change [N m/s]; none by default: it may step."
 _LAG_TEXT = "Time constant with which the torque follows its command [s]."
 
@@ -254,14 +245,7 @@ _LAG_TEXT = "Time constant with which the torque follows its command [s]."
     key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", _LENGTH),
     key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", _RADIUS, default=0.0),
     key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", _INERTIA),
-    key(
-        "viscous",
-        "Viscous friction of the joint [N m s].",
-        NONNEGATIVE,
-        "drag",
-        _VISCOUS,
-        default=0.0,
-    ),
+    key("viscous", _VISCOUS_TEXT, NONNEGATIVE, "drag", _VISCOUS, default=0.0),
     key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", _DRY, default=0.0),
     key("torque_limit", "[N m]", POSITIVE, "torque", _TORQUE, _STRENGTH),
     key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", _SPEED),
@@ -347,23 +331,19 @@ class Scales(NamedTuple):
         return Scales(length, mass, force, *motion, *others)
 
 
+_PERIOD = relate_time(1e-3, 1e2, "times the scene's time")
+_COLLIDE_TEXT = "Whether the links stop each other; false where they move in different planes."
+_PERIOD_TEXT = "Period over which torques are held; with 0 they are free [s]."
+_HOLD_TEXT = (
+    "Whether torques are constant over each period, or lines that go on from period to period."
+)
+
+
 @declare(
     key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", Range(1e-3, 1e5)),
-    key(
-        "fingers_collide",
-        "Whether the links stop each other; false where they move in different planes.",
-        BOOLEAN,
-    ),
-    key(
-        "control_period",
-        "Period over which torques are held; with 0 they are free [s].",
-        *(NONNEGATIVE, "time", relate_time(1e-3, 1e2, "times the scene's time")),
-    ),
-    key(
-        "control_hold",
-        "Whether torques are constant over each period, or lines that go on from period to period.",
-        choice(*HOLDS),
-    ),
+    key("fingers_collide", _COLLIDE_TEXT, BOOLEAN),
+    key("control_period", _PERIOD_TEXT, NONNEGATIVE, "time", _PERIOD),
+    key("control_hold", _HOLD_TEXT, choice(*HOLDS)),
 )
 @dataclass(frozen=True, eq=False)
 class Scene:

@@ -33,8 +33,7 @@ from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
-from .stepper import Modes
-from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, System
+from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Modes, System
 
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
@@ -74,14 +73,6 @@ class ContactProblem:
         units = 1 / np.sqrt((lifted * rows).sum(axis=1))
         K = (lifted @ pushes.T) * (units[:, None] * units)
         return units[:k], units[k:], K, units * np.concatenate([self.b_n, self.b_t])
-
-    @cached_property
-    def is_unique(self) -> bool:
-        """Whether there is surely one solution: nothing may stick, K + K^T is positive definite."""
-        if len(self.b_t):
-            return False
-        K = self.scaled[2]
-        return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
 
     def describe(self, answer: ContactAnswer) -> list[int]:
         """Modes of an answer as `list_answers` has them."""
@@ -264,13 +255,6 @@ def _choose(table: Array, rows: Numbers, pivots: Array) -> int:
     return int(rows[least[0]])
 
 
-class ClosedContacts(NamedTuple):
-    """Pairs that touch and do not part, each constraint once, and their rows at present."""
-
-    pairs: tuple[int, ...]
-    rows: ContactRows
-
-
 class StepEnd(NamedTuple):
     """One end of a step."""
 
@@ -279,39 +263,37 @@ class StepEnd(NamedTuple):
     ranges: Array
 
 
-class Pattern:
-    """Closed pairs and coordinates at rest, and sliding signs of the others."""
+class ClosedContacts:
+    """Pairs that touch and do not part, each constraint once; sliding signs, and what stands."""
 
-    def __init__(self, run: FreeRun, found: ClosedContacts) -> None:
-        system = run.system
-        self.system, self.closed, self.rows = system, *found
-        v_t = self.rows.A_t @ run.v
-        self.mu = system.friction[list(self.closed)]
+    def __init__(self, system: System, pairs: tuple[int, ...], rows: ContactRows, v: Array) -> None:
+        self.system, self.pairs, self.rows, v_t = system, pairs, rows, rows.A_t @ v
+        self.mu = system.friction[list(pairs)]
         rubs = self.mu > 0
         slow = np.abs(v_t) < STANDING * system.scales.speed
         self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
-        self.rub = (self.mu * self.Xi)[:, None]
         self.standing = (rubs & slow).nonzero()[0]
-        slow = np.abs(run.v) < STANDING * system.units[system.n :]
-        self.sigma = np.where((system.dry > 0) & ~slow, np.sign(run.v), 0.0)
+        slow = np.abs(v) < STANDING * system.units[system.n :]
+        self.sigma = np.where((system.dry > 0) & ~slow, np.sign(v), 0.0)
         self.joints = ((system.dry > 0) & slow).nonzero()[0]
+
+    def pose_impact(self, v: Array) -> ContactProblem:
+        """Contact problem of velocities: whatever has friction may stick."""
+        at, rubs = self.rows, self.mu.nonzero()[0]
+        T, mu = at.A_t[rubs], self.mu[rubs]
+        return ContactProblem(
+            1 / self.system.mass, at.A, at.A, at.A @ v, T, T @ v, rubs, mu, 0 * mu
+        )
 
     def pose(self, free: Array, rows: ContactRows) -> ContactProblem:
         """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
-        system, lift, standing = self.system, 1 / self.system.mass, self.standing
-        G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
-        none = np.zeros(len(self.joints))
-        return ContactProblem(
-            lift,
-            rows.A,
-            G,
-            b_n,
-            np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]]),
-            np.append(rows.A_t[standing] @ free + rows.bend_t[standing], free[self.joints]),
-            np.append(standing, none - 1).astype(int),
-            np.append(self.mu[standing], none),
-            np.append(np.zeros(len(standing)), system.dry[self.joints]),
-        )
+        system, standing, none = self.system, self.standing, np.zeros(len(self.joints))
+        G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ free + rows.bend
+        T = np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]])
+        b_t = T @ free + np.append(rows.bend_t[standing], none)
+        owner, mu = np.append(standing, none - 1).astype(int), np.append(self.mu[standing], none)
+        bound = np.append(0 * self.mu[standing], system.dry[self.joints])
+        return ContactProblem(1 / system.mass, rows.A, G, b_n, T, b_t, owner, mu, bound)
 
     def recall(self, modes: Modes) -> list[int]:
         """Modes as `list_answers` has them."""
@@ -319,40 +301,37 @@ class Pattern:
         standing = set(self.standing.tolist())
         choice = [
             MODES[signs[pair] if k in standing else 0.0] if pair in signs else APART
-            for k, pair in enumerate(self.closed)
+            for k, pair in enumerate(self.pairs)
         ]
         return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
 
     def make_modes(self, answer: ContactAnswer, at: ContactRows) -> Modes:
         """Independent constraints, of rows `at` a state, that give the answer's motion."""
-        system, closed = self.system, self.closed
+        system, closed = self.system, self.pairs
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
         order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
         adds, root = Independent(DEPENDENT).add, np.sqrt(system.mass)
         A, A_t = at.A / root, at.A_t / root
         kept = {k for k in order if presses[k] and adds(A[k])}
-        count, stuck, held = len(self.standing), [], []
-        Xi, sigma = self.Xi.copy(), self.sigma.copy()
-        sigma[self.joints] = answer.sign[count:]
+        count, held, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()
+        sigma[self.joints] = answer.sign[len(self.standing) :]
+        rows, places = np.vstack([A_t, np.eye(system.n)]), [*self.standing, *(count + self.joints)]
         # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first:
         # decisions in the least-time policy of the square do not end else.
         for j in np.argsort(-answer.shares, kind="stable").tolist():
-            sign = answer.sign[j]
-            if j >= count:
-                joint = int(self.joints[j - count])
-                if sign == 0 and adds(np.eye(system.n)[joint]):
-                    held.append(joint)
-            elif (k := int(self.standing[j])) in kept:
-                Xi[k] = sign
-                if sign == 0 and adds(A_t[k]):
-                    stuck.append(k)
+            row, sign = int(places[j]), answer.sign[j]
+            if row in kept:
+                Xi[row] = sign
+            if sign == 0 and (row in kept or row >= count) and adds(rows[row]):
+                held.append(row)
         # What touches without a force stays, for as long as it needs none.
         kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(A[k])}
         order = sorted(kept)
-        pairs, stick = tuple(closed[k] for k in order), sorted((closed[k],) for k in stuck)
+        below = [*order, *range(count, count + system.n)]
+        holders = tuple((below.index(row),) for row in sorted(held))
         signs = tuple(Xi[order].tolist()), tuple(sigma.tolist())
-        return Modes(pairs, tuple(stick), tuple(sorted(held)), *signs)
+        return Modes(tuple(closed[k] for k in order), holders, *signs)
 
 
 class FreeRun(Run):
@@ -386,7 +365,15 @@ class FreeRun(Run):
 
         `touching` are gaps to close at the start [m].
         """
-        self._close(touching)
+        system, root = self.system, np.sqrt(self.system.mass)
+        for _ in range(5):
+            # Project onto what touches, in the metric of masses.
+            gaps, ranges = system.look(self.z)
+            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
+            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
+                break
+            rows = system.evaluate(self.z, self.v, near).A / root
+            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
         while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
             if self.t >= self.stop:
                 self.next_piece()
@@ -398,25 +385,22 @@ class FreeRun(Run):
             if not self.gets_on():
                 self.note(EventKind.GIVEN_UP, "decisions do not end")
                 return
-            if rests is None:
-                if not self._jolt():
-                    self.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
-                    if not self.records:
-                        self.record(still=True)
-                    return
-                continue
-            self.resting = rests
+            failure = "no motion obeys the laws of contact" if rests is None else ""
+            self.resting = self.resting if rests is None else rests
             if rests:
                 self.set_velocity(0.0)
                 self._hold()
-                continue
-            try:
-                self.move()
-            except StuckError:
-                # Forces grow without bound where the motion jams.
-                if not self._jolt():
-                    self.note(EventKind.GIVEN_UP, "steps become too short")
-                    return
+            elif not failure:
+                try:
+                    self.move()
+                except StuckError:
+                    # Forces grow without bound where the motion jams.
+                    failure = "steps become too short"
+            if failure and not self._jolt():
+                self.note(EventKind.GIVEN_UP, failure)
+                if not self.records:
+                    self.record(still=True)
+                return
 
     # Instants: impacts and modes.
 
@@ -439,18 +423,6 @@ class FreeRun(Run):
     def _is_still(self, acceleration: Array) -> bool:
         return self.system.is_slower(acceleration * self.system.scales.time, STILL)
 
-    def _close(self, touching: float) -> None:
-        """Project the start onto what touches, in the metric of masses."""
-        system = self.system
-        root = np.sqrt(system.mass)
-        for _ in range(5):
-            gaps, ranges = system.look(self.z)
-            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
-            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
-                break
-            rows = system.evaluate(self.z, self.v, near).A / root
-            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
-
     def _face(self, z: Array, v: Array) -> tuple[Array, Flags]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
         scales = self.system.scales
@@ -468,8 +440,6 @@ class FreeRun(Run):
         near = (gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces
         touching: list[int] = near.nonzero()[0].tolist()
         rows = system.evaluate(self.z, self.v, touching)
-        if not touching:
-            return ClosedContacts((), rows)
         slow = (rows.A @ self.v < self.chatter).tolist()
         lines = rows.A / np.sqrt(system.mass)
         lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
@@ -480,7 +450,8 @@ class FreeRun(Run):
                 chosen.append(k)
         chosen.sort()
         pairs = tuple(touching[k] for k in chosen)
-        return ClosedContacts(pairs, ContactRows(*(part[chosen] for part in rows)))
+        rows = ContactRows(*(part[chosen] for part in rows))
+        return ClosedContacts(system, pairs, rows, self.v)
 
     def _collide(self) -> ClosedContacts:
         """Resolve impacts until no closed gap closes further; what is closed then."""
@@ -495,13 +466,19 @@ class FreeRun(Run):
         return self._find_closed()
 
     def _strike(self, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
-        answer = solve_problem(self._pose(closed, self.v))
+        answer = solve_problem(closed.pose_impact(self.v))
         if answer is None:
             raise ArithmeticError("the plastic impact has no solution")
         self.residual = max(self.residual, answer.residual)
-        v = self.v + answer.change
+        mass, v = self.system.mass, self.v + answer.change
         if bouncing and self.restitution:
-            v = self._expand(closed, answer, v)
+            # Poisson's expansion, unless it would gain energy.
+            impulse = self.restitution * answer.c_n
+            pushed = v + closed.rows.A.T @ impulse / mass
+            problem = closed.pose_impact(pushed)
+            expands = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
+            after = v if expands is None else pushed + expands.change
+            v = after if after**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
         pause = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
             if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
@@ -516,40 +493,20 @@ class FreeRun(Run):
                 self.note(kind, note, name, float(-rates[k]))
         self.set_velocity(v)
 
-    def _pose(self, closed: ClosedContacts, v: Array) -> ContactProblem:
-        """Contact problem of velocities: whatever has friction may stick."""
-        system, rows = self.system, closed.rows
-        mu = system.friction[list(closed.pairs)]
-        rubs = np.flatnonzero(mu > 0)
-        T, none = rows.A_t[rubs], np.zeros(len(rubs))
-        return ContactProblem(
-            1 / system.mass, rows.A, rows.A, rows.A @ v, T, T @ v, rubs, mu[rubs], none
-        )
-
-    def _expand(self, closed: ClosedContacts, plastic: ContactAnswer, v: Array) -> Array:
-        """Velocity after expansion with Poisson's restitution; `v` where that would gain energy."""
-        mass, impulse = self.system.mass, self.restitution * plastic.c_n
-        pushed = v + closed.rows.A.T @ impulse / mass
-        problem = self._pose(closed, pushed)
-        answer = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
-        after = v if answer is None else np.asarray(pushed + answer.change)
-        return after if after**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
-
     def _jolt(self) -> bool:
         """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
         system = self.system
         closed = self._find_closed()
-        pattern = Pattern(self, closed)
-        free = system.push(self.v, self.tau(self.t), pattern.sigma) / system.mass
-        answer = solve_problem(self._pose(closed, self.v + SETTLING * system.scales.time * free))
+        free = system.push(self.v, self.tau(self.t), closed.sigma) / system.mass
+        answer = solve_problem(closed.pose_impact(self.v + SETTLING * system.scales.time * free))
         if answer is None:
             return False
         # With the modes that it ends in, the impact at the instant itself is linear.
-        problem = self._pose(closed, self.v)
+        problem = closed.pose_impact(self.v)
         exact = list_answers(problem, problem.describe(answer))
         if not exact or system.is_slower(exact[0].change, STANDING):
             return False
-        names = " ".join(system.names[pair] for pair in pattern.closed)
+        names = " ".join(system.names[pair] for pair in closed.pairs)
         text = f"no finite forces keep {names} closed: an impact without a collision"
         self.note(EventKind.INCONSISTENT, text, names)
         self.set_velocity(self.v + exact[0].change)
@@ -560,34 +517,34 @@ class FreeRun(Run):
         system, lift = self.system, 1 / self.system.mass
         if (np.abs(closed.rows.A @ self.v) > STANDING * system.scales.speed).any():
             # What is closed and parts more slowly than chatter is closed at rest, all at once.
-            pairs, rows = closed
+            pairs, rows = closed.pairs, closed.rows
             sticks = np.abs(rows.A_t @ self.v) < self.chatter
-            sticks &= system.friction[list(pairs)] > 0
+            sticks &= closed.mu > 0
             self.project_velocity(np.vstack([rows.A, rows.A_t[sticks]]))
-            closed = ClosedContacts(pairs, system.evaluate(self.z, self.v, pairs))
-        pattern = Pattern(self, closed)
+            rows = system.evaluate(self.z, self.v, pairs)
+            closed = ClosedContacts(system, pairs, rows, self.v)
         later = SETTLING * system.scales.time
-        free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
-        first = self._answer(pattern.pose(free, pattern.rows), pattern.recall(self.modes))
+        free = lift * system.push(self.v, self.tau(self.t), closed.sigma)
+        first = self._answer(closed.pose(free, closed.rows), closed.recall(self.modes))
         if first is None:
             return None
         acceleration = free + first.change
         v = self.v + later * acceleration
-        rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
-        coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
-        answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
+        rows = system.evaluate(self.z + later * (self.v + v) / 2, v, closed.pairs)
+        coming = lift * system.push(v, self.tau(self.t + later), closed.sigma)
+        answer = self._choose(closed, closed.pose(coming, rows), coming, first)
         if answer is None:
             return None
         # What rests leaves its last modes by rounding, before it takes others in which it rests.
         still = self.resting or self._is_still(acceleration)
         rests = self.stands and still and self._is_still(coming + answer.change)
-        modes = pattern.make_modes(answer, rows)
-        self._note_changes(pattern.closed, modes, rests)
+        modes = closed.make_modes(answer, rows)
+        self._note_changes(closed.pairs, modes, rests)
         self.modes = modes
         # Rounding of speeds that are zero.
-        kept = [k for k, pair in enumerate(pattern.closed) if pair in modes.kept]
-        joints = np.eye(system.n)[pattern.joints]
-        at_rest = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing], joints]
+        kept = [k for k, pair in enumerate(closed.pairs) if pair in modes.kept]
+        joints = np.eye(system.n)[closed.joints]
+        at_rest = [closed.rows.A[kept], closed.rows.A_t[closed.standing], joints]
         self.project_velocity(np.vstack(at_rest))
         return rests
 
@@ -603,20 +560,23 @@ class FreeRun(Run):
         return answer
 
     def _choose(
-        self, pattern: Pattern, problem: ContactProblem, free: Array, before: ContactAnswer
+        self, closed: ClosedContacts, problem: ContactProblem, free: Array, before: ContactAnswer
     ) -> ContactAnswer | None:
         """The answer nearest to the last one; what rests stays at rest if possible.
 
         `free` has the accelerations without contacts, shape (n,); `before` is an answer a little
         earlier.
         """
-        last = pattern.recall(self.modes)
-        self.unique = problem.is_unique
+        last = closed.recall(self.modes)
+        # There is surely one solution if nothing may stick and K + K^T is positive definite.
+        K = problem.scaled[2]
+        slides = not len(problem.b_t)
+        self.unique = slides and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > SINGULAR)
         answers = [] if self.unique else list_answers(problem)
         if len(answers) > 1:
             modes = [problem.describe(answer) for answer in answers]
             if self.modes.kept or len(problem.b_n):
-                self._note_ambiguity(pattern, modes)
+                self._note_ambiguity(closed, modes)
             starts = [self.resting and not self._is_still(free + a.change) for a in answers]
             away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
             return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
@@ -664,15 +624,15 @@ class FreeRun(Run):
         elif self.resting:
             self.note(EventKind.START, "the motion begins")
 
-    def _note_ambiguity(self, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
+    def _note_ambiguity(self, closed: ClosedContacts, answers: Sequence[Sequence[int]]) -> None:
         """Record that there are several answers, once for each set of contacts."""
-        names = [self.system.names[pair] for pair in pattern.closed]
+        names = [self.system.names[pair] for pair in closed.pairs]
         slides = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
         turns = {STICKS: "is held", FORTH: "turns +", BACK: "turns -"}
         told = [(name, slides) for name in names]
-        for k in pattern.standing.tolist():
+        for k in closed.standing.tolist():
             told[k] = names[k], slides | {STICKS: "sticks"}
-        told += [(_name(self.system, joint), turns) for joint in pattern.joints.tolist()]
+        told += [(_name(self.system, joint), turns) for joint in closed.joints.tolist()]
         differs = [len(set(modes)) > 1 for modes in zip(*answers, strict=True)]
         texts = []
         for answer in answers:
@@ -737,23 +697,27 @@ class FreeRun(Run):
         self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
         self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
-        gaps = self.before.gaps
+        gaps = self.after.gaps
         sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
         self.level = np.where(gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
         self.shift = np.maximum(self.slack, self.slack - self.values)
-        self.h = min(self.h, self._time_to_return())
+        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
+        if near.any():
+            # Half the time in which the nearest pair that has just parted would close again. What
+            # parts more slowly was closed when the modes were chosen.
+            at = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
+            rate, bend = at.A @ self.v, at.A @ self.s.outputs.acceleration + at.bend
+            back = (rate >= self.chatter) & (bend < 0)
+            self.h = float((-rate[back] / bend[back]).min(initial=self.h))
         self.record()
         super().move()
 
-    def look(self) -> None:
-        """Start from the present state."""
-        super().look()
-        self._advance()
-
-    def _advance(self) -> None:
+    def begin_step(self) -> None:
         """Start the next step, of `REACH` at most, from the end of the one just made."""
+        super().begin_step()
         self.before = self.after
+        self.shift = np.where(self.values > 0, self.slack, self.shift)
         _, speed, push = np.abs(self.after.motion / self.system.units[: self.system.n]).max(axis=1)
         root = math.sqrt(speed**2 + 2 * push * REACH)
         self.longest = float(2 * REACH / (speed + root + 1e-300))
@@ -765,16 +729,6 @@ class FreeRun(Run):
         motion = motion.reshape(3, self.system.n)
         self.after = StepEnd(motion, *self.system.look(motion[0]))
         return np.concatenate([out.values, self.after.ranges[self.kept] / self.unit])
-
-    def keep(self, t: float) -> None:
-        """Take the step just made, to time `t`, and record its end."""
-        super().keep(t)
-        self._advance()
-        self.shift = np.where(self.values > 0, self.slack, self.shift)
-
-    def handle(self, found: list[int]) -> bool:
-        """End the motion at an event."""
-        return True
 
     def pass_break(self) -> bool | None:
         """Go on to the next piece of the torques; the motion ends if they end or modes change."""
@@ -789,8 +743,8 @@ class FreeRun(Run):
 
     def _holds(self) -> bool:
         """Whether the modes are the only solution after a torque step, by more than rounding."""
-        modes, rows, at = self.s.modes, self.s.rows, self.before
-        if not self.unique or modes.stuck or modes.held:
+        modes, rows, at = self.s.modes, self.s.rows, self.after
+        if not self.unique or modes.holders:
             return False
         clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
         # What has no direction has no speed that could reverse.
@@ -801,37 +755,33 @@ class FreeRun(Run):
         return bool((self.values > clear).all()) and not touches.any()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
-        """The first pair that closes within the step just made, but those `done`, and when."""
-        passed = [pair for pair in done if pair >= 0]
+        """The first pair that closes within the step just made, but those `done`, and when.
+
+        Pairs that do not face each other there do not count.
+        """
+        n, passed = self.system.n, [pair for pair in done if pair >= 0]
         while bracket := self._find_bracket(h, passed):
-            if (root := self._find_contact(h, *bracket)) is not None:
-                return bracket[0], root
-            passed.append(bracket[0])
+            pair, level, left, right = bracket
+
+            def value(step: float, pair: int = pair, level: float = level) -> float:
+                self.step_to(step)
+                return float(self.after.gaps[pair]) - level
+
+            first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
+            last = value(right)
+            if last >= 0 and right < h:
+                # The bracket is that of an interpolation, which grazing may mislead.
+                right, last = h, value(h)
+            if last < 0:
+                # Some ten roundings of the gap count as closed.
+                root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
+                self.step_to(root)
+                y = self.s.outputs.y
+                if self._face(y[:n], y[n : 2 * n])[1][pair]:
+                    return pair, root
+            passed.append(pair)
             self.step_to(h)
         return None
-
-    def _find_contact(
-        self, h: float, pair: int, level: float, left: float, right: float
-    ) -> float | None:
-        """When a pair closes within a step; None if it does not, or where the two do not face."""
-        n = self.system.n
-
-        def value(step: float) -> float:
-            self.step_to(step)
-            return float(self.after.gaps[pair]) - level
-
-        first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
-        last = value(right)
-        if last >= 0 and right < h:
-            # The bracket is that of an interpolation, which grazing may mislead.
-            right, last = h, value(h)
-        if last >= 0:
-            return None
-        # Some ten roundings of the gap count as closed.
-        root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
-        self.step_to(root)
-        y = self.s.outputs.y
-        return root if self._face(y[:n], y[n : 2 * n])[1][pair] else None
 
     def _find_bracket(
         self, h: float, passed: Sequence[int]
@@ -882,19 +832,6 @@ class FreeRun(Run):
                 return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
             self.step_to(h)
         return None
-
-    def _time_to_return(self) -> float:
-        """Half the time in which the nearest pair that has just parted would close again [s]."""
-        gaps = self.before.gaps
-        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
-        if not near.any():
-            return math.inf
-        rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
-        rate = rows.A @ self.v
-        bend = rows.A @ self.s.outputs.acceleration + rows.bend
-        # What parts more slowly was closed when the modes were chosen.
-        back = (rate >= self.chatter) & (bend < 0)
-        return float((-rate[back] / bend[back]).min(initial=np.inf))
 
 
 def _name(system: System, joint: int) -> str:

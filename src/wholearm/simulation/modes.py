@@ -5,7 +5,7 @@ joint with theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
-Vertices of a flush edge slide and stick as one, with one force T of friction (`stepper`), |T| <=
+Vertices of a flush edge slide and stick as one, with one force T of friction (`system`), |T| <=
 sum mu c_n. A contact flush with a rolling one has no friction of its own.
 
 **At rest.** Each choice of signs of sliding and turning, and of what sticks, makes accelerations
@@ -48,12 +48,12 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import close_all, find_freedoms, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
-from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
-from .stepper import Modes
-from .system import ROUNDING_FORCE, STILL, ContactRows, build_system
+from .system import ROUNDING_FORCE, STILL, ContactRows, Modes, build_system
+
+_JOINTS = np.eye(5)[3:]  # rows that give the rates of the joints from z'
 
 
 class Unit(NamedTuple):
@@ -91,21 +91,16 @@ class Mode:
         return self.formation.n_contacts + len(self.holders)
 
     @property
-    def held(self) -> tuple[list[int], list[int]]:
-        """First row of each contact, or flush edge, that rolls or sticks; joints that are held."""
-        first, count = [rows[0] for rows in self.holders], self.formation.n_contacts
-        return [row for row in first if row < count], [row - count for row in first if row >= count]
+    def held(self) -> list[int]:
+        """First row of each contact, flush edge or joint that rolls, sticks or is held."""
+        return [rows[0] for rows in self.holders]
 
     def find_modes(self) -> Modes:
         """The same of the pairs of features of the scene, without signs."""
-        names, formation = build_system(self.formation.scene).names, self.formation
-        pairs = tuple(names.index(name) for name in formation.names)
-        stuck = [rows for rows in self.holders if rows[0] < len(pairs)]
-        return Modes(
-            pairs,
-            tuple(tuple(pairs[row] for row in rows) for rows in stuck),
-            tuple(3 + joint for joint in self.held[1]),
-        )
+        # Coordinates 3 and 4 are those of the joints.
+        below = self.formation.n_contacts
+        holders = (rows if rows[0] < below else (rows[0] + 3,) for rows in self.holders)
+        return Modes(_list_pairs(self.formation), tuple(holders))
 
     def declares(self, holder: int) -> bool:
         """Whether the phase asks for what the `holder`-th force after c_n holds."""
@@ -145,10 +140,19 @@ def list_modes(
             yield tried, mode
 
 
+def _list_pairs(formation: Formation) -> tuple[int, ...]:
+    """Pairs of features of the scene that touch in a formation."""
+    names = build_system(formation.scene).names
+    return tuple(names.index(name) for name in formation.names)
+
+
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:
-    """Constraint rows of a formation at one state, with its contacts closed."""
-    system = build_system(formation.scene)
-    return system.evaluate(z, v, [system.names.index(name) for name in formation.names])
+    """Constraint rows of a formation at one state, with its contacts closed.
+
+    Those of sliding, A_t (n_c + 2, 5) and bend_t (n_c + 2,), have the joints below the contacts.
+    """
+    rows = build_system(formation.scene).evaluate(z, v, _list_pairs(formation))
+    return rows._replace(A_t=np.vstack([rows.A_t, _JOINTS]), bend_t=np.append(rows.bend_t, [0, 0]))
 
 
 class Response(NamedTuple):
@@ -192,11 +196,9 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
 
     `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
     """
-    scene, count = mode.formation.scene, mode.formation.n_contacts
-    (stuck, held), slip = mode.held, mode.formation.sliding_friction * signs[:count]
-    hold = np.vstack([rows.A_t[stuck], np.eye(5)[3:][held]])
-    P, G = (np.vstack([part, hold]) for part in (rows.A, rows.A - slip[:, None] * rows.A_t))
-    bend = np.concatenate([rows.bend, rows.bend_t[stuck], np.zeros(len(held))])
+    scene, count, held = mode.formation.scene, mode.formation.n_contacts, mode.held
+    slip = (mode.formation.sliding_friction * signs[:count])[:, None] * rows.A_t[:count]
+    P, G = (np.vstack([part, rows.A_t[held]]) for part in (rows.A, rows.A - slip))
     inverse_mass = 1 / scene.mass_diagonal
     if mode.n_constraints > mode.formation.n_constraints:
         lines = P * np.sqrt(inverse_mass)
@@ -206,29 +208,26 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
     applied[3:, 0] -= scene.dry[3:] * signs[count:]
-    applied[3:, 1:] = np.eye(2)
+    applied[:, 1:] = _JOINTS.T
     drop = P * inverse_mass
     K = drop @ G.T
     ratio = float(np.linalg.det(K) / np.linalg.det(drop @ P.T))
     c = np.zeros((len(P), 3))
     if abs(ratio) > 1e-12:
         right = -drop @ applied
-        right[:, 0] -= bend
+        right[:, 0] -= np.append(rows.bend, rows.bend_t[held])
         c = np.asarray(np.linalg.solve(K, right), dtype=float)
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
-    rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
-    rates[:count, 0] += rows.bend_t
+    rates = rows.A_t @ acceleration
+    rates[:, 0] += rows.bend_t
     return Response(mode, signs, c, acceleration, rates, ratio)
 
 
 def find_fixed(mode: Mode, rows: ContactRows) -> Flags:
     """Which contacts, then joints, a mode keeps fixed, (n_c + 2,)."""
-    A, A_t, joints = rows.A, rows.A_t, np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)
-    held = [A, A_t[mode.held[0]], joints[mode.held[1]]]
-    free = np.vstack([A_t, joints]) / root
+    P, free = np.vstack([rows.A, rows.A_t[mode.held]]) / root, rows.A_t / root
     length = np.linalg.norm(free, axis=1)
-    P = np.vstack(held) / root
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     return np.asarray(np.linalg.norm(free - (free @ basis.T) @ basis, axis=1) < 1e-7 * length)
 
@@ -355,7 +354,7 @@ class Rest:
             at = formation.evaluate(self.z[None], heading[None])
             bend = -move_least(at.P, at.P_dot_v, formation.scene.mass_diagonal)[0]
             rows = evaluate_rows(formation, self.z, heading)
-            ahead = np.concatenate([rows.A_t @ bend + rows.bend_t, bend[3:]])
+            ahead = rows.A_t @ bend + rows.bend_t
             moves = np.abs(ahead) > 1e-7 * fastest * scale
             rates = np.where(still, np.where(moves, ahead, 0.0), rates)
         return np.asarray(np.sign(rates))
@@ -363,7 +362,8 @@ class Rest:
     def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
         scene, count = self.formation.scene, self.formation.n_contacts
-        rows = ContactRows(self.statics.A, self.statics.A_t, *np.zeros((3, count)))
+        still, A_t = np.zeros(count + 2), np.vstack([self.statics.A_t, _JOINTS])
+        rows = ContactRows(self.statics.A, A_t, still[:count], still, still)
         response = respond(mode, signs, rows, np.zeros(5))
         if response is None:
             return None
@@ -396,13 +396,16 @@ class Rest:
         normals, bounds = self.held
         loss = x
         if np.isfinite(bounds).all():
-            loss = find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
+            reserves = -normals @ coefficients
+            reserves[:, 0] += bounds
+            loss = find_breach(reserves, x)
         least, every = 1e3 * _measure_drive(self.formation.scene), list(self.list_modes())
         margins = [mode.margins for mode in every]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
         # Where a margin changes sign; in between, no mode changes.
-        polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
+        polynomials = rows[:, 1:] @ coefficients
+        polynomials[:, 0] += rows[:, 0]
         starts, middles = _split(polynomials, x)
         torques = polyval(middles, coefficients.T)
         values = rows[:, :1] + rows[:, 1:] @ torques
@@ -418,7 +421,8 @@ class Rest:
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
-        tau = polyval(np.asarray(x), coefficients.T)
+        tau, rolls = polyval(np.asarray(x), coefficients.T), self.formation.n_rolling
+        count = self.formation.n_contacts
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.list_modes() if mode.slides(tau)]
@@ -426,8 +430,12 @@ class Rest:
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
-            row, least, c_t = find_weakest(self.formation, weakest)
-            return Collapse(x, self.formation.names[row], least, jams, c_t)
+            normal, *cones = np.split(weakest, np.cumsum([count, rolls]))
+            row, c_t = int(normal.argmin()), None
+            if normal[row] >= 0 and rolls:
+                k = int(np.minimum(*cones).argmin())
+                row, c_t = self.formation.rolling_rows[k], float(cones[1][k] - cones[0][k]) / 2
+            return Collapse(x, self.formation.names[row], float(normal[row]), jams, c_t)
         row = int(pulls.argmax())
         return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
 
@@ -447,11 +455,6 @@ def find_rest(formation: Formation, z: Array) -> Rest:
 def _measure_drive(scene: Scene) -> float:
     """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
     return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
-
-
-def _constant(values: Array, coefficients: Array) -> Array:
-    """Values, shape (m,), as polynomials of as many coefficients as those of a piece."""
-    return np.pad(values[:, None], ((0, 0), (0, coefficients.shape[1] - 1)))
 
 
 def _split(polynomials: Array, x: float) -> tuple[Array, Array]:

@@ -46,9 +46,10 @@ from ..results.torque import TorqueProfile
 from . import modes
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES
 from .system import (
     FIRST_STEP,
+    INNER_STAGES,
+    NODES,
     REACHED,
     REST_WINDOW,
     ROUNDING_FORCE,
@@ -177,11 +178,10 @@ class Replay(Run):
     def signs(self, signs: Array) -> None:
         self.s.inputs.Xi[:], self.s.inputs.sigma[3:] = signs[:-2], signs[-2:]
 
-    def take(self, mode: modes.Mode) -> None:
-        """Go on with the steps of a mode of the phase's formation."""
+    def take(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
+        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
         self.load(mode.find_modes())
-        self.signs = np.zeros(self.formation.n_contacts + 2)
-        self.mode, self.heading = mode, np.zeros(5)
+        self.mode, self.signs, self.heading = mode, signs, heading
         rows, count = self.s.rows, len(self.ends.texts)
         self.turning = slice(rows.slide.start, rows.slide.stop + 2)
         self.limit = slice(self.turning.stop, self.turning.stop + count)
@@ -214,23 +214,13 @@ class Replay(Run):
         """A value that starts within rounding of zero has to fall below that."""
         return np.where(self.start > self.slack, 0.0, self.slack)
 
-    def observe(self) -> None:
-        """Evaluate the present state, and record it."""
-        self.look()
-        self.record()
-
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
         if self.v.any():
             self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
-        self.require_inertia()
-
-    def require_inertia(self) -> None:
-        """Raise a `JammingError` where friction leaves no reduced inertia."""
-        ratio = float(self.s.outputs.ratio[0])
-        if not ratio > 0:
-            self.fail_to_step(ratio)
+        if not self.s.outputs.ratio[0] > 0:
+            self.fail_to_step(float(self.s.outputs.ratio[0]))
 
     def fail_to_step(self, ratio: float) -> NoReturn:
         """Raise the error for a step size that underflows."""
@@ -317,12 +307,15 @@ class Replay(Run):
         text = f"{goal} is reached at t = {self.t:.5g} s, the end of phase {len(phases)}"
         return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
 
-    def _arrive(self, window: float, stepped: bool = False) -> Ending:
+    def _arrive(self, window: float | None = None, stepped: bool = False) -> Ending:
         """End the phase; if it ends at rest the motion stops, with a plastic impact if need be.
 
         If the next step of the torques, or their end, comes within the `window` [s], or before the
         motion was to end, the arrival belongs to it; the latter not if they have just `stepped`.
+        While moving the window is short.
         """
+        if window is None:
+            window = self.settling if abs(self._measure_rate()) < SLOW else 0.0
         until, following = self.phase.until, self.following
         self.note(EventKind.ARRIVAL, f"{until} reached", str(until), -self.rate)
         if self._strikes() and following is not None:
@@ -500,7 +493,7 @@ class Replay(Run):
     def handle(self, kinds: Sequence[int]) -> Ending | None:
         """End the motion at events, or go on."""
         if len(self.slack) - 2 in kinds:
-            return self._reach()
+            return self._arrive()
         if len(self.slack) - 1 in kinds:
             return self.come_to_rest()
         pulling = [k for k in kinds if k < self.s.rows.force.stop]
@@ -517,12 +510,8 @@ class Replay(Run):
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
             # Phase 1 of scene 584 of seed 1128 turns 5 nm before its end, for the least time.
-            return self._reach()
+            return self._arrive()
         return self.restart(turning)
-
-    def _reach(self) -> Ending:
-        """The end of the phase is reached while moving."""
-        return self._arrive(self.settling if abs(self._measure_rate()) < SLOW else 0.0)
 
     def _find_remaining(self) -> float:
         """Time until the torques to come slow the motion no more, or have stopped it [s].
@@ -600,7 +589,8 @@ class Replay(Run):
             side = math.copysign(1.0, self.y[row] - value)
         self.ends = _build_ends(formation, until, side)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
-        self.take(modes.find_mode(formation, np.ones(formation.n_contacts + 2)))
+        none = np.zeros(formation.n_contacts + 2)
+        self.take(modes.find_mode(formation, none + 1), none, np.zeros(5))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
@@ -647,22 +637,16 @@ class Replay(Run):
             fixed = modes.find_fixed(mode, modes.evaluate_rows(formation, self.z, self.v))
             gripped = (row for u in modes.list_units(formation) if u.grips for row in u.rows)
             self.stuck = {row for row in gripped if fixed[row]}
-        self.start_with(mode, signs, departure.heading)
-        self.observe()
+        self.take(mode, signs, departure.heading)
+        self.look()
+        self.record()
         return self.move()
-
-    def start_with(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
-        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
-        if mode != self.mode:
-            self.take(mode)
-        self.signs = signs
-        self.heading = heading
 
     def go_on(self) -> Ending | None:
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
         self.heading = v / np.sqrt(self.system.mass @ v**2)
-        rates = np.concatenate([modes.evaluate_rows(formation, self.z, v).A_t @ v, v[3:]])
+        rates = modes.evaluate_rows(formation, self.z, v).A_t @ v
         movable = [row for unit in modes.list_units(formation) for row in unit.rows]
         signs = np.zeros(len(rates))
         signs[movable] = np.where(rates < 0, -1.0, 1.0)[movable]
@@ -679,12 +663,14 @@ class Replay(Run):
         """
         if self._decide(turned, enters):
             return self.come_to_rest()
-        self.observe()
+        self.look()
+        self.record()
         ended, c_n = self._bridge(SETTLING), self.s.outputs.c_n
         # By more than rounding: phase 5 of leg 59 of seed 1128.
         if ended or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(BRIDGED)):
             return self.come_to_rest()
-        self.require_inertia()
+        if not self.s.outputs.ratio[0] > 0:
+            self.fail_to_step(float(self.s.outputs.ratio[0]))
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()
         reserves, holders = self._measure_reserves(), self.mode.holders
@@ -728,12 +714,11 @@ class Replay(Run):
         rows = modes.evaluate_rows(formation, self.z, self.v)
         fixed = modes.find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
-        gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
         first = np.array([unit.rows[0] for unit in still])
-        wrong = first[(chosen[first] == 0) | (chosen[first] * (gradients[first] @ self.v) < 0)]
-        rolling = gradients[list(formation.rolling_rows)]
-        self.project_velocity(np.vstack([rows.A, rolling, gradients[wrong]]))
-        self.start_with(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
+        wrong = first[(chosen[first] == 0) | (chosen[first] * (rows.A_t[first] @ self.v) < 0)]
+        stays = [*formation.rolling_rows, *wrong]
+        self.project_velocity(np.vstack([rows.A, rows.A_t[stays]]))
+        self.take(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
         for unit in still:
             row = unit.rows[0]
             before = 0.0 if row in self.stuck else float(signs[row])
@@ -838,7 +823,8 @@ class Replay(Run):
             self.coast(self.t + float(self.s.inputs.h[0]))
         ended = self._decide(rows)
         if not ended:
-            self.observe()
+            self.look()
+            self.record()
         return ended
 
     def note_change(self, row: int, before: float, after: float) -> None:

@@ -14,8 +14,17 @@ from ..common.arrays import Array, Flags, find_root
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
-from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
-from .system import FIRST_STEP, SHORTEST_STEP, STANDING, System
+from .system import (
+    FIRST_STEP,
+    LOSSES,
+    ORDER,
+    SHORTEST_STEP,
+    STANDING,
+    Modes,
+    ModeStepper,
+    System,
+    build_stepper,
+)
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 
@@ -57,7 +66,7 @@ class Run(ABC):
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
-        self.steps_at = [True, *self.find_torque_steps(torque).tolist()]
+        self.steps_at = [True, *self.find_torque_steps(torque.jumps).tolist()]
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
@@ -110,9 +119,9 @@ class Run(ABC):
         """
         return None
 
-    @abstractmethod
     def handle(self, found: list[int]) -> Any:
-        """How events end the motion; None if it goes on."""
+        """How events, by their rows, end the motion; None if it goes on."""
+        return True
 
     @abstractmethod
     def pass_break(self) -> Any:
@@ -145,9 +154,9 @@ class Run(ABC):
         start, stop = self.breaks[self.piece : self.piece + 2]
         return (start + stop + x * (stop - start)) / 2
 
-    def find_torque_steps(self, torque: TorqueProfile) -> Flags:
-        """Whether torques step between successive pieces, shape (k - 1,)."""
-        return np.asarray(np.abs(torque.jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
+    def find_torque_steps(self, jumps: Array) -> Flags:
+        """Whether torques step, by their differences between pieces, shape (k, 2) [N m]."""
+        return np.asarray(np.abs(jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
 
     def set_velocity(self, v: Array | float) -> None:
         """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
@@ -202,9 +211,8 @@ class Run(ABC):
             forces = dict(zip(names, last.c_n.tolist(), strict=True))
         self.feedback.begin(self.piece, theta, theta_dot, forces)
         if self.piece:
-            first, (breaks, pieces) = self.piece - 1, (self.torque.breaks, self.torque.coefficients)
-            pair = TorqueProfile(breaks[first : first + 3], pieces[first : first + 2])
-            self.steps_at[self.piece] = bool(self.find_torque_steps(pair)[0])
+            held = self.torque.coefficients[self.piece - 1 : self.piece + 1, :, 0]
+            self.steps_at[self.piece] = bool(self.find_torque_steps(np.diff(held, axis=0))[0])
 
     def step_to(self, h: float) -> None:
         """Repeat the step with another length."""
@@ -277,6 +285,10 @@ class Run(ABC):
             if ending is not None:
                 return ending
 
+    def begin_step(self) -> None:
+        """Start the next step from the state whose event values are known."""
+        self.start = self.values
+
     def try_step(self, target: float) -> tuple[float, bool]:
         """Make a step within the tolerance, to `target` [s] at most.
 
@@ -285,7 +297,7 @@ class Run(ABC):
         h, whole  its length [s] and whether it ends at `target`
         """
         remaining, time = target - self.t, self.system.scales.time
-        self.start = self.values
+        self.begin_step()
         least = SHORTEST_STEP * max(time, abs(self.t))
         while True:
             h = min(self.h, self.longest)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,8 +27,7 @@ from ..results.trajectory import Trajectory
 from .events import Energies, EventKind, Outcome, OutcomeKind, Simulation, list_stretches
 from .prescribed import Replay
 from .run import Feedback, Law, Run
-from .stepper import Modes
-from .system import SLOW, build_system
+from .system import SLOW, Modes, build_system
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
@@ -103,7 +102,14 @@ def simulate(
         require_phases(problem)
         run = Replay(problem, profile, tolerance, wanted, minima)
         return _conclude(run, problem, *run.play(progress))
-    state = _require_start(problem.start if start is None else start)
+    try:
+        state = np.asarray(problem.start if start is None else start, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("", "start", "does not hold numbers") from None
+    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+        text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
+        raise InputError("", "start", text)
+    state = np.concatenate([state, np.zeros(10 - len(state))])
     if require_number(restitution, "restitution", nonnegative=True) > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     end = None if until is None else require_number(until, "until", positive=True)
@@ -125,39 +131,27 @@ def simulate_free(problem: Problem, what: Torques | Law, **options: Any) -> Simu
     return simulate(problem, what, contacts="free", **options)
 
 
-@exclusive
 def simulate_phases(
     problem: Problem,
     plan: Trajectory,
-    *,
     progress: Callable[[str], None] | None = None,
     **options: float,
-) -> list[tuple[range, Simulation]]:
-    """Simulate the phases of a plan one by one, each from its planned start, with free contacts.
+) -> Iterator[tuple[range, Simulation]]:
+    """Indices and simulations of a plan's phases, each from its planned start, with free contacts.
 
     Phases that pass into one another in motion, by the plan's velocities, are simulated together.
-    Returns indices of phases with each simulation.
-
-    Parameters
-    ----------
-    progress  told which phase is simulated
-    options   restitution and tolerance, as of `simulate`
+    `options` are restitution and tolerance, as of `simulate`.
     """
-    starts, simulations = plan.phase_starts, []
+    starts, system = plan.phase_starts, build_system(problem.scene)
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
-    system = build_system(problem.scene)
     rests = [row for row in range(1, len(rows)) if system.is_slower(plan.z_dot[rows[row]], SLOW)]
     for first, stop in pairwise([0, *rests, len(rows)]):
         if progress is not None:
             progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
         profile = plan.torque.cut(float(starts[first]), float(starts[stop]))
-        row = rows[first]
-        state = np.concatenate([plan.z[row], plan.z_dot[row]])
-        hint = _recall(problem, plan, row)
-        clock = starts[first:stop].tolist()
-        simulation = _simulate(problem, profile, state, clock, hint, None, **options)
-        simulations.append((range(first, stop), simulation))
-    return simulations
+        row, clock = rows[first], starts[first:stop].tolist()
+        state, hint = np.append(plan.z[row], plan.z_dot[row]), _recall(problem, plan, row)
+        yield range(first, stop), _simulate(problem, profile, state, clock, hint, None, **options)
 
 
 def _simulate(
@@ -254,16 +248,4 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
     Xi = np.where(rolls, 0.0, slides)
     turns = np.sign(v + ahead * a) * (system.dry > 0)
-    stuck = tuple((pair,) for pair, one in zip(kept, rolls, strict=True) if one)
-    return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
-
-
-def _require_start(start: ArrayLike) -> Array:
-    try:
-        state = np.asarray(start, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("", "start", "does not hold numbers") from None
-    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
-        text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
-        raise InputError("", "start", text)
-    return np.concatenate([state, np.zeros(10 - len(state))])
+    return Modes(tuple(kept), (), tuple(Xi.tolist()), tuple(turns.tolist()))

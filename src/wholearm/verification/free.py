@@ -24,12 +24,11 @@ from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
-from ..results.report import Deviation
+from ..results.report import DEPARTURE, Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -80,7 +79,7 @@ def verify_free(
         phases, failures = _follow(whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
-    for indices, part in simulate_phases(problem, plan, progress=progress, **options):
+    for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
         warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
@@ -89,7 +88,7 @@ def verify_free(
             title, end = f"phase {phase.number} alone", phase.deviation
             failures += [f"{title}: {loss.describe()}" for loss in phase.losses]
             assert end is not None
-            if measure_departure(end, problem.scene.scales.length) > allowed:
+            if end.measure(problem.scene.scales.length) > allowed:
                 away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
                 failures.append(f"{title} ends {away}")
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
@@ -174,13 +173,13 @@ def find_policy(
     for speed in CONTACT_SPEEDS if contact_speed is None else (contact_speed,):
         policy = make_policy(problem, plan, contact_speed=speed, **values)
         report = verify_policy(problem, plan, policy, departure=departure)
-        if usual is not None and report.ok:
+        if report.ok and usual is not None:
             text = f"contacts are made at {speed:g} times the usual speed: otherwise "
             warnings = (*report.warnings, text + "; ".join(usual[1].failures))
-            report = replace(report, warnings=warnings)
-        if report.ok:
-            return policy, report
+            return policy, replace(report, warnings=warnings)
         usual = usual or (policy, report)
+        if report.ok:
+            return usual
     assert usual is not None
     return usual
 

@@ -4,42 +4,65 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ..common.arrays import Array, find_lowest
+from ..common.arrays import Array, Numbers, find_lowest
 from ..common.errors import InputError
+from ..common.fields import POSITIVE, declare, key, read_keys
 from ..common.sharing import exclusive
-from ..contacts.contact_limits import evaluate_finger_gap
-from ..contacts.formation import Formation
+from ..contacts.contact_limits import FINGERS_TOUCH, evaluate_finger_gap
+from ..contacts.formation import Formation, Kinematics
+from ..geometry.curve import describe_pose
 from ..geometry.tracing import EndDistance
+from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows
-from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
-from ..mechanics.statics import Statics
-from ..mechanics.uniqueness import UNIQUENESS_MARGIN
+from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
+from ..mechanics.statics import SURE, Statics
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem
 from ..results import report as results
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
-from ..results.report import Deviation
+from ..results.report import DEPARTURE, Deviation
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
+from ..scene.model import Scene
 from ..simulation import modes
 from ..simulation.events import EventKind, Simulation
-from ..simulation.simulate import simulate
 from ..simulation.system import SETTLING
-from . import verdict
 
 if TYPE_CHECKING:
     from .free import FreeReport
 
+REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
+STRAY = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
+EXACT_REST = 1e-9  # speed of rest but for rounding, relative to the scene's speed
+PLACES = 33
+"""Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is reported
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
+
+
+@declare(key("departure", kind=POSITIVE), key("rest_speed", kind=POSITIVE), UNIQUENESS)
+@dataclass(frozen=True)
+class Allowance:
+    """What a replay may differ by from what is asked and still hold.
+
+    InputError if one of the first two is not positive, or the last is 1 or more.
+    """
+
+    departure: float = DEPARTURE  # departure, rest_speed: as of `verify`
+    rest_speed: float = REST_SPEED
+    uniqueness_margin: float = UNIQUENESS_MARGIN  # least one of contact forces
+
+    def __post_init__(self) -> None:
+        read_keys(self)
 
 
 @overload
@@ -49,8 +72,8 @@ def verify(
     *,
     contacts: Literal["prescribed"] = "prescribed",
     tolerance: float = 1e-9,
-    departure: float = verdict.DEPARTURE,
-    rest_speed: float = verdict.REST_SPEED,
+    departure: float = DEPARTURE,
+    rest_speed: float = REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
 ) -> results.Report: ...
@@ -65,8 +88,8 @@ def verify(
     *,
     contacts: str = "prescribed",
     tolerance: float = 1e-9,
-    departure: float = verdict.DEPARTURE,
-    rest_speed: float = verdict.REST_SPEED,
+    departure: float = DEPARTURE,
+    rest_speed: float = REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
     **options: Any,
@@ -103,7 +126,7 @@ def verify(
         text = f"{', '.join(options)} needs free ones" if options else f"{contacts!r} given"
         raise InputError("", "contacts", f"{text}; known: prescribed, free")
     problem, torque, plan = adopt_torques(problem, what)
-    allowance = verdict.Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
+    allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)
     simulation = observe(problem, torque, plan, tolerance)
     report = judge(simulation, plan, allowance, tolerance, uniqueness=True, reduced=reduced)
@@ -120,6 +143,8 @@ def observe(
     With a `plan` that is where it has rows, to compare it with. JammingError, SimulationError if
     the simulation cannot go on.
     """
+    from ..simulation.simulate import simulate  # not needed without a replay
+
     if plan is None:
         times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
     else:
@@ -146,7 +171,7 @@ def find_finger_gap(simulation: Simulation) -> results.FingerGap:
 def judge(
     simulation: Simulation,
     plan: Trajectory | None,
-    allowance: verdict.Allowance,
+    allowance: Allowance,
     tolerance: float = 1e-9,
     uniqueness: bool = False,
     reduced: bool = False,
@@ -163,8 +188,8 @@ def judge(
     gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
     reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
-    failures += verdict.describe_failures(simulation, phases, gap if reached else None, allowance)
-    thin = list(verdict.describe_thin_margins(simulation, phases))
+    failures += describe_failures(simulation, phases, gap if reached else None, allowance)
+    thin = list(describe_thin_margins(simulation, phases))
     warnings = _describe_torques(problem, torque)
     warnings += [
         f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
@@ -182,7 +207,7 @@ def judge(
             failures.append(results.Failure(max(number, 1), text))
     if plan is not None:
         # The departure of later phases follows from that of the first.
-        failures += thin + list(verdict.describe_departures(problem, phases, allowance))[:1]
+        failures += thin + list(describe_departures(problem, phases, allowance))[:1]
     else:
         warnings += [failure.text for failure in thin]
     return results.Report(
@@ -225,8 +250,10 @@ def _report_phase(
     pressing = _find_least(simulation, index, forces, EventKind.CONTACT_LOST)
     columns = [simulation.contacts.index(name) for name in formation.names]
     c_n, c_t = (c[rows][:, columns] for c in (simulation.c_n, simulation.c_t))
-    names = [formation.names[row] for row in formation.rolling_rows]
-    margins = dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
+    margins = {
+        formation.names[row]: formation.friction[row] * c_n[:, row] - np.abs(c_t[:, row])
+        for row in formation.rolling_rows
+    }
     slips = _find_least(simulation, index, margins, EventKind.SLIP)
     end = worst = held = least = None
     if uniqueness:
@@ -234,11 +261,11 @@ def _report_phase(
         starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
         breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
         since = max(breaks, default=-math.inf)
-        held = verdict.find_wedged(problem, phase, simulation, rows, verdict.REST_SPEED, since)
-        least = verdict.find_uniqueness_margin(phase, simulation, rows)
+        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, since)
+        least = find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
         end, worst = _compare(simulation, plan, phase, bool(arrivals))
-    last_speed = verdict.measure_speed(problem.scene, simulation.z_dot[rows[-1]])
+    last_speed = measure_speed(problem.scene, simulation.z_dot[rows[-1]])
     return results.PhaseReport(
         number=phase.number,
         until=until,
@@ -415,6 +442,167 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     return misses
 
 
+def measure_stray(problem: Problem) -> float:
+    """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
+    return 5e-7 * problem.scene.scales.force + STRAY * problem.epsilon
+
+
+def measure_speed(scene: Scene, v: Array) -> float:
+    """Largest speed in z', shape (5,) [m/s]: angular ones count times the scene's length."""
+    length = scene.scales.length
+    return max(math.hypot(v[0], v[1]), length * float(np.abs(v[2:]).max()))
+
+
+def describe_failures(
+    simulation: Simulation,
+    phases: Sequence[results.PhaseReport],
+    gap: results.FingerGap | None,
+    allowance: Allowance,
+) -> Iterator[results.Failure]:
+    """Ends elsewhere than pinned or at a speed, links that overlap, contact forces not unique."""
+    problem, scene = simulation.problem, simulation.problem.scene
+    for event in simulation.find(EventKind.ARRIVAL):
+        phase = problem.phases[event.phase]
+        first, row = np.flatnonzero(simulation.phase == event.phase)[[0, -1]].tolist()
+        z, v = simulation.z[row], simulation.z_dot[row]
+        if phase.until.measure_pins(z, scene.scales.length) > allowance.departure:
+            text = f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
+            yield results.Failure(phase.number, text)
+        fast = measure_speed(scene, v) > allowance.rest_speed * scene.scales.speed
+        if phase.end is End.REST and fast:
+            speed, turns = math.hypot(v[0], v[1]), np.abs(v[2:])
+            fastest, energy = int(turns.argmax()), 0.5 * float(scene.mass_diagonal @ v**2)
+            moves = f"the object moves at {speed:.3g} m/s"
+            if scene.scales.length * turns[fastest] > speed:
+                body = ("the object", "finger 1", "finger 2")[fastest]
+                moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
+            unit = EndDistance.to_leading(scene, phase.until, simulation.z[first]).unit
+            text = (
+                f"phase {phase.number} does not end at rest: {phase.until} is reached at "
+                f"{event.value:.3g} {unit}/s at t = {event.time:.5g} s, while {moves}, with "
+                f"{energy:.3g} J left"
+            )
+            yield results.Failure(phase.number, text)
+    # More than passes for touching.
+    if gap is not None and gap.least < -3e-5 * scene.scales.length:
+        number = [phase.number for phase in phases if phase.start <= gap.time][-1]
+        text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
+        yield results.Failure(number, f"{text}, phase {number}")
+    for one in phases:
+        least = one.uniqueness_margin
+        # Those of a replay may be a little less than those of its plan.
+        if least is not None and least.value < allowance.uniqueness_margin - 1e-3:
+            place = describe_pose(simulation.z[np.searchsorted(simulation.t, least.time)])
+            asked = allowance.uniqueness_margin
+            text = describe_uniqueness(least.value, least.contacts, place, asked)
+            yield results.Failure(
+                one.number, f"{text}, at t = {least.time:.5g} s, phase {one.number}"
+            )
+
+
+def describe_departures(
+    problem: Problem, phases: Sequence[results.PhaseReport], allowance: Allowance
+) -> Iterator[results.Failure]:
+    """Sentences on the phases whose replay is too far from the plan."""
+    length, allowed = problem.scene.scales.length, allowance.departure
+    for phase in phases:
+        deviations = [d for d in (phase.deviation, phase.end_deviation) if d is not None]
+        far = max(deviations, key=lambda d: d.measure(length), default=None)
+        if far is not None and far.measure(length) > allowed:
+            text = (
+                f"phase {phase.number} departs from the plan, by {far.position:.2g} m and "
+                f"{far.angle:.2g} rad at t = {far.time:.5g} s; {allowed * length:.2g} "
+                f"m and {allowed:.2g} rad are allowed"
+            )
+            yield results.Failure(phase.number, text)
+
+
+def describe_thin_margins(
+    simulation: Simulation, phases: Sequence[results.PhaseReport]
+) -> Iterator[results.Failure]:
+    """Sentences on the normal forces below epsilon, but for contacts where they were lost."""
+    problem = simulation.problem
+    lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
+    for phase in phases:
+        for c in phase.contacts:
+            thin = c.margin < -measure_stray(problem)
+            if thin and (phase.number, c.contact) not in lost:
+                text = f"below epsilon = {problem.epsilon:g} N, at t = {c.time:.5g} s"
+                text = f"c_n of {c.contact} falls to {c.least:.5g} N, {text}, phase {phase.number}"
+                yield results.Failure(phase.number, text)
+
+
+def find_uniqueness_margin(
+    phase: Phase, motion: Trajectory | Simulation, rows: Numbers
+) -> results.UniquenessMargin | None:
+    """The least uniqueness margin in a phase; None if nothing moved.
+
+    Tangential forces tell which way a contact slides; one that leans on no side of its cone sticks.
+    Forces within cones at rest do not count: they are statically indeterminate, see `find_wedged`.
+    `rows` are its rows in the phase.
+    """
+    formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
+    scene, z_dot = formation.scene, motion.z_dot[rows]
+    columns = [motion.contacts.index(name) for name in formation.names]
+    c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
+    slides = np.abs(c_t) >= (1 - 1e-6) * formation.friction * np.abs(c_n)
+    # Case: phase 9 of query 44 under rate limits.
+    moves = [measure_speed(scene, v) > EXACT_REST * scene.scales.speed for v in z_dot]
+    counted = ~np.isnan(c_n).any(axis=1) & (np.array(moves) | slides.all(axis=1))
+    if not counted.any():
+        return None
+    rows, slides, Xi = rows[counted], slides[counted], -np.sign(c_t * c_n)[counted]
+    kinematics = formation.evaluate(motion.z[rows], z_dot[counted])
+    margins = []
+    for pattern in sorted(set(map(tuple, slides.tolist()))):
+        rows_of = np.flatnonzero((slides == pattern).all(axis=1))
+        part = Kinematics(*(array[rows_of] for array in kinematics))
+        sticking = tuple(np.flatnonzero(np.logical_not(pattern)).tolist())
+        ratio, names, row = find_minors(formation, part, Xi[rows_of], sticking).find_least()
+        margins.append(results.UniquenessMargin(ratio, names, float(motion.t[rows[rows_of[row]]])))
+    return min(margins)
+
+
+def find_wedged(
+    problem: Problem,
+    phase: Phase,
+    motion: Trajectory | Simulation,
+    rows: Numbers,
+    slow: float,
+    start: float = -np.inf,
+) -> float | None:
+    """Time for which friction may hold a phase that begins at rest (static indeterminacy) [s].
+
+    Until no contact forces within their cones, of all contacts that touch, balance torques and
+    gravity: see `mechanics.statics`. None if the phase does not begin at rest.
+
+    Parameters
+    ----------
+    rows         its rows in the phase
+    slow         speed that passes for rest, relative to the scene's
+    start : [s]  since when the phase is to move, if its rows begin with the time for which it is
+                 held
+    """
+    scene, contacts = problem.scene, phase.formation.contacts
+    if phase.index:
+        if measure_speed(scene, motion.z_dot[rows[0]]) > slow * scene.scales.speed:
+            return None
+        contacts += problem.phases[phase.index - 1].formation.contacts
+    touching = Formation(scene, tuple(dict.fromkeys(contacts)))
+    static = Statics(touching, motion.z[rows[0]]).torque_polygon()
+    start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
+    t = np.linspace(start, stop, 4 * PLACES)
+    # At its end the torques are those of the next phase.
+    beyond = static.measure(motion.torque.at(t[:-1])) - SURE * scene.scales.torque
+    free = np.flatnonzero(beyond > 0)
+    if not len(free):
+        return float(stop - start)
+    if free[0] == 0:
+        return 0.0
+    before, after = beyond[free[0] - 1], beyond[free[0]]
+    return float((free[0] - after / (after - before)) * (t[1] - t[0]))
+
+
 _OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
@@ -496,7 +684,7 @@ def find_help(
         if e.kind in _KINDS and (e.kind is not EventKind.SLIP or e.contact in rolling[e.phase])
     ]
     ended = {event[:2] for event in events}
-    allowed = verdict.measure_stray(problem)
+    allowed = measure_stray(problem)
     events += [
         (phase.number - 1, margin.contact, "thin", margin.time)
         for phase in phases
@@ -548,9 +736,9 @@ def _examine_loss(
             )
             for name, c_n, c_t in zip(formation.names, response.c, response.c_t, strict=False)
         )
-    if response is not None and distance is not None:
-        slope = -distance[1][0] @ response.acceleration
-        closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
+        if distance is not None:
+            slope = -distance[1][0] @ response.acceleration
+            closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
     when = float(simulation.t[row])
     return results.Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
@@ -679,7 +867,7 @@ def find_moving(
     That is the friction with which torques `tau` give the recorded `acceleration`, shape (5,).
     """
     scene, rows = formation.scene, modes.evaluate_rows(formation, z, v)
-    speeds = np.concatenate([rows.A_t @ v, v[3:]])
+    speeds = rows.A_t @ v
     units = np.repeat([scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2])
     slow = np.abs(speeds) < 1e-6 * units
     signs = np.sign(speeds)
