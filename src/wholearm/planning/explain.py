@@ -396,18 +396,14 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
     for `advise`.
     """
     problem, phases = search.source, search.phases
-    epsilon, last = search.problem.epsilon, stages[-1]
-    stage, node, phase = stages[0], 0, phases[0]
-    statics = Statics(stage.formation, stage.guess.nodes[0, 0])
-    blocked = statics.find_block(epsilon)
-    say = "from rest at its start, {}, no motion begins in any contact mode"
+    epsilon, last, phase = search.problem.epsilon, stages[-1], phases[0]
     alone = len(phases) == 1 and not phase.until.is_release
-    if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
-        stage, node = last, -1
-        statics = Statics(last.formation, last.guess.nodes[-1, 0])
-        blocked = statics.find_block(epsilon, ends=True)
-        say = "at its end, {}, no motion comes to rest in any contact mode"
-    if blocked is None:
+    one_end = alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1
+    for stage, node in [(stages[0], 0), *[(last, -1)] * one_end]:
+        statics = Statics(stage.formation, stage.guess.nodes[node, 0])
+        if blocked := statics.find_block(epsilon, ends=node == -1):
+            break
+    else:
         first = stages[0].formation
         names = " ".join(first.names)
         z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
@@ -425,7 +421,9 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
             )
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
-    text = f"phase {phase.number} is infeasible: {say.format(where)}"
+    none = f"at its end, {where}, no motion comes to rest"
+    none = none if node else f"from rest at its start, {where}, no motion begins"
+    text = f"phase {phase.number} is infeasible: {none} in any contact mode"
     shortfalls = list[Shortfall]()
     if blocked.contact:
         amount = blocked.short * problem.scene.scales.force
@@ -494,18 +492,14 @@ def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
 
 def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    phase, epsilon = search.phases[0], search.source.epsilon
+    number = search.phases[0].number
     if not margins or (best := max(margins, key=lambda margin: margin.value)).value > -0.02:
         return
-    limits = make_limits(phase.formation, epsilon).limits
-    limit = next(limit for limit in limits if (limit.kind, limit.part) == best[1:3])
-    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
-    shortfall = Shortfall(*best[1:3], limit.text, missed * limit.scale, limit.unit, place, missed)
-    raise InfeasibleError(
-        f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
-        f"{shortfall}",
-        [shortfall],
-    )
+    limit, missed, place = best.limit, -best.value, LimitPlace(number, math.nan, "the best of them")
+    what = limit.kind, limit.part, limit.text, missed * limit.scale, limit.unit
+    shortfall = Shortfall(*what, place, missed)
+    text = f"phase {number} is infeasible along all straight paths to its ends, at any speed: "
+    raise InfeasibleError(f"{text}{shortfall}", [shortfall])
 
 
 def explain_stages(
@@ -581,7 +575,7 @@ def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfa
         limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
         tau = blend(at, part.tau.shape[1]) @ part.tau
         y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
-        middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+        middles = passed + np.cumsum(part.h) - part.h / 2
         places = [
             LimitPlace(stage.phase + 1, t, f"t = {t:.4f} s, phase {stage.phase + 1}")
             for t in np.repeat(middles, len(pick)).tolist()

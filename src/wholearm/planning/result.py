@@ -38,6 +38,9 @@ _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ra
 """Options that stand in `meta` by themselves."""
 
 
+_DEVIATIONS = ("end_deviation", "deviation")
+
+
 class Status(Enum):
     """How planning has ended."""
 
@@ -202,7 +205,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
     )
     # Deviations have the names of their units in files.
     for phase in values["replay"]["phases"] if plan.replay else ():
-        for key in ("end_deviation", "deviation"):
+        for key in _DEVIATIONS:
             phase[key] = phase[key] and dict(
                 zip(("m", "rad", "s"), phase[key].values(), strict=True)
             )
@@ -230,20 +233,16 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
     """The replay, whose deviations have the names of their units in files."""
 
-    def rename(own: Mapping[str, Any]) -> dict[str, Any]:
+    def rename(key: str, entry: Any) -> Any:
+        if key not in _DEVIATIONS or entry is None:
+            return entry
         # Files of earlier versions do not say when.
-        return {"position": own["m"], "angle": own["rad"], "time": own.get("s")}
+        return {"position": entry["m"], "angle": entry["rad"], "time": entry.get("s")}
 
-    phases = [
-        {
-            **phase,
-            **{key: phase[key] and rename(phase[key]) for key in ("end_deviation", "deviation")},
-        }
-        for phase in given["phases"]
-    ]
     # In earlier versions intervals were doubled for a replay to hold.
     entries = {key: value for key, value in given.items() if key != "refinements"}
-    figures: ReplayFigures = restore(ReplayFigures, {**entries, "phases": phases})
+    phases = [{key: rename(key, phase[key]) for key in phase} for phase in given["phases"]]
+    figures: ReplayFigures = restore(ReplayFigures, entries | {"phases": phases})
     return figures
 
 

@@ -397,11 +397,6 @@ class TimeIterate:
         return [find_misses(stage, check, epsilon, margin) for stage, check in pairs]
 
     @cached_property
-    def over(self) -> list[Array]:
-        """The largest miss of each interval of each stage, over its tolerance."""
-        return [measure_misses(miss) for miss in self.misses]
-
-    @cached_property
     def monitored(self) -> list[Stage]:
         """The stages with limits of their formations that are violated between points."""
         lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in self.checks]
@@ -425,7 +420,7 @@ class TimeIterate:
             limit, shares = search.problem.scene.torque_limit, list[Array]()
             for part in (stage.guess for stage in stages):
                 bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
-                shares.append(part.duration * part.fractions * bends)
+                shares.append(part.h * bends)
             return [share * (self.change / max(_sum(shares), 1e-300)) for share in shares]
         square, gains = float(search.goal is Objective.EFFORT), list[Array]()
         x, weights = np.polynomial.legendre.leggauss(7)
@@ -507,7 +502,7 @@ class TimeIterate:
         """The largest miss, over its tolerance; infinite where the NLP lacks a limit."""
         if self.monitored is not self.stages:
             return math.inf
-        return float(max(ratios.max() for ratios in self.over))
+        return float(max(measure_misses(miss).max() for miss in self.misses))
 
     @property
     def error(self) -> float:

@@ -93,8 +93,7 @@ def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
 class StagePoints(NamedTuple):
     """Motion and forces of a stage in K intervals with d points each."""
 
-    duration: float  # [s]
-    fractions: Array  # (K,): share of the duration that each interval has
+    h: Array  # (K,) [s]: durations of the intervals
     nodes: Array  # (K + 1, 2, 5): z and z' at the start of each interval and at the end of the last
     z: Array  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
     v: Array
@@ -102,6 +101,16 @@ class StagePoints(NamedTuple):
     forces: Array  # (K, d, n_c + R) [N]: c_n of all contacts, then c_t of the rolling ones
     tau: Array  # (K, m, 2) [N m]: control points of torques, of degree m - 1 in each interval
     impulses: Array  # (n_c + R,) [N s]: of the impact with which the stage ends, if it does
+
+    @property
+    def duration(self) -> float:
+        """How long the stage lasts [s]."""
+        return float(self.h.sum())
+
+    @property
+    def fractions(self) -> Array:
+        """Share of the duration that each interval has, shape (K,)."""
+        return np.asarray(self.h / self.duration)
 
     @property
     def breaks(self) -> Array:
@@ -153,7 +162,7 @@ class Stage:
     @property
     def intervals(self) -> int:
         """Number of intervals K."""
-        return len(self.guess.fractions)
+        return len(self.guess.h)
 
     @property
     def ending(self) -> Formation:
@@ -170,8 +179,7 @@ class Stage:
         """The same stage with a guess that takes so many times as long."""
         part = self.guess
         nodes, v, a = part.nodes / [[1.0], [factor]], part.v / factor, part.a / factor**2
-        longer = part._replace(duration=factor * part.duration, nodes=nodes, v=v, a=a)
-        return replace(self, guess=longer)
+        return replace(self, guess=part._replace(h=factor * part.h, nodes=nodes, v=v, a=a))
 
     def begin_at(self, z: Array, v: Array) -> Stage:
         """The same stage with another state, (5,) each, where its guess begins."""
@@ -296,7 +304,7 @@ def unit_points(scales: Scales) -> StagePoints:
     """Units of motion and forces in SI units."""
     z, unit, force = unit_lengths(scales), scales.time, scales.force
     nodes, torque, impulse = np.stack([z, z / unit]), scales.torque, force * unit
-    units: Any = (unit, 1.0, nodes, z, z / unit, z / unit**2, force, torque, impulse)
+    units: Any = (unit, nodes, z, z / unit, z / unit**2, force, torque, impulse)
     return StagePoints(*units)
 
 
@@ -315,8 +323,7 @@ def resample(
     part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
 ) -> StagePoints:
     """Part of a stage from `begin` to `stop`, on intervals with `breaks`, (K + 1,), in [0, 1]."""
-    span = stop - begin
-    fractions = np.diff(breaks)
+    span, fractions = stop - begin, np.diff(breaks)
     inner = breaks[:-1, None] + fractions[:, None] * scheme.points
     shape = (len(fractions), scheme.degree, -1)
     points = _interpolate(part, scheme, (begin + span * inner).ravel())
@@ -331,12 +338,13 @@ def resample(
     x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
     tau = fit_controls(at, blend(x, controls) @ part.tau[k], controls)
     impulses = part.impulses if stop == 1.0 else part.impulses[:0]
-    return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
+    h = part.duration * span * fractions
+    return StagePoints(h, nodes, z, v, a, forces, tau, impulses)
 
 
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
     """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
-    count, degree = len(part.fractions), scheme.degree
+    count, degree = len(part.h), scheme.degree
     # z'' and forces may step after the last point of an interval.
     k = np.clip(np.searchsorted(part.breaks, places - 1e-12) - 1, 0, count - 1)
     x = (places - part.breaks[k]) / part.fractions[k]

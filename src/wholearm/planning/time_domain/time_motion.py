@@ -210,12 +210,12 @@ class TimeMotion:
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
-        owner = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.stages) - 1)
-        order, parts = np.argsort(owner, kind="stable"), list[Samples]()
-        for index, stage in enumerate(self.stages):
-            if (owner == index).any():
-                parts.append(stage.evaluate(t[owner == index] - self.starts[index]))
-        inverse = np.argsort(order)
+        owner = np.searchsorted(self.starts[1:-1], t, side="right")
+        parts = [
+            self.stages[k].evaluate(t[owner == k] - self.starts[k])
+            for k in sorted({*owner.tolist()})
+        ]
+        inverse = np.argsort(np.argsort(owner, kind="stable"))
         return Samples(*(np.concatenate(tables)[inverse] for tables in zip(*parts, strict=True)))
 
 

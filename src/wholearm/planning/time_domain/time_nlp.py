@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -60,6 +61,7 @@ SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, a
 class StageLayout:
     """Indices of one stage's unknowns; those of `StagePoints` have the shapes there."""
 
+    h: Indices
     nodes: Indices
     z: Indices
     v: Indices
@@ -67,7 +69,6 @@ class StageLayout:
     forces: Indices
     tau: Indices
     impulses: Indices  # of the impact that leads to the next stage, if one does
-    h: Indices  # (K,): durations of the intervals
     margin: Indices  # (K + 1, 1) or (K + 1, 0): copies of a margin or relaxation at the nodes
     short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     begin: Indices  # begin, finish: c_n, c_t and friction of the joints at rest at both ends, of
@@ -112,6 +113,7 @@ def lay_out(
         jumps = stage.ends_in_impact and k + 1 < len(stages)
         layouts.append(
             StageLayout(
+                at["h"][:, 0],
                 np.vstack([first, ends]).reshape(K + 1, 2, 5),
                 z,
                 v,
@@ -119,7 +121,6 @@ def lay_out(
                 forces,
                 at["tau"].reshape(K, m, 2),
                 impulses=take(stages[k + 1].formation.n_constraints if jumps else 0),
-                h=at["h"][:, 0],
                 margin=np.vstack([first_margin, at["m"]]),
                 short=at["short"],
                 begin=begin,
@@ -129,32 +130,23 @@ def lay_out(
     return layouts
 
 
-_TABLES = StagePoints._fields[2:]
-
-
 def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: float) -> Array:
     """Unknowns as one vector."""
     x = np.zeros(layouts[-1].stop)
     for part, layout in zip(points, layouts, strict=True):
-        for name in _TABLES:
-            x[getattr(layout, name)] = getattr(part, name)
-        x[layout.h], x[layout.short], x[layout.margin] = part.duration * part.fractions, 1.0, margin
-        for held, forces in (
-            (layout.begin, part.forces[0, 0]),
-            (layout.finish, part.forces[-1, -1]),
-        ):
+        for name, table in part._asdict().items():
+            x[getattr(layout, name)] = table
+        x[layout.short], x[layout.margin] = 1.0, margin
+        ends = (layout.begin, part.forces[0, 0]), (layout.finish, part.forces[-1, -1])
+        for held, forces in ends:
             x[held[: len(forces)]] = forces[: len(held)]
     return x
 
 
 def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     """What `pack` put together."""
-    parts = []
-    for layout in layouts:
-        duration = float(x[layout.h].sum())
-        tables = [x[getattr(layout, name)] for name in _TABLES]
-        parts.append(StagePoints(duration, x[layout.h] / duration, *tables))
-    return parts
+    names = StagePoints._fields
+    return [StagePoints(*(x[getattr(layout, name)] for name in names)) for layout in layouts]
 
 
 class Target(NamedTuple):
@@ -615,8 +607,9 @@ def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> Fl
 
 
 class _Piece(NamedTuple):
-    """An interval as a part of a period: stage, period, share of the stage, and unknowns."""
+    """An interval as a part of a period: phase, stage, period, share of the stage, unknowns."""
 
+    phase: int
     stage: int
     period: int
     share: float
@@ -632,15 +625,14 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
     scene, duration = stages[0].formation.scene, stages[0].period
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
     pieces = [
-        (stage.phase, _Piece(k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau))
+        _Piece(stage.phase, k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau)
         for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
         for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
     ]
     first: Indices | None = None  # durations of the parts of the first period that is not a last
-    for _, pairs in groupby(pieces, key=lambda pair: pair[0]):
-        phase = [piece for _, piece in pairs]
+    for phase in (list(group) for _, group in groupby(pieces, key=attrgetter("phase"))):
         last = phase[-1].period
-        for period, group in groupby(phase, key=lambda piece: piece.period):
+        for period, group in groupby(phase, key=attrgetter("period")):
             parts, least = list(group), 0.0 if period == last else duration
             spans = np.array([piece.h for piece in parts])
             if duration or first is not None:
