@@ -526,11 +526,8 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
     if block_before is not None:
-        before = (
-            block_before.chain.curves[-1]
-            if block_before.chain
-            else block_before.plans[-1].end_torques[1]
-        )
+        chain, last_plan = block_before.chain, block_before.plans[-1]
+        before = chain.curves[-1] if chain else last_plan.end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     beyond: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):

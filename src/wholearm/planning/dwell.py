@@ -201,15 +201,13 @@ def find_ends(
     firm: bool = False,
 ) -> list[DwellEnd | None]:
     """Dwells of given times [s] at ends at rest; None for all others."""
-    ends = list[DwellEnd | None]()
-    for place, time in zip(places, times, strict=True):
-        if place is None or time <= 0:
-            ends.append(None)
-            continue
+
+    def hold(place: Standstill) -> Hold | None:
         goal = place._replace(gained=None) if firm else place
-        hold = find_hold(goal, problem.epsilon, problem.gap)
-        ends.append(DwellEnd(place, time, hold, firm))
-    return ends
+        return find_hold(goal, problem.epsilon, problem.gap)
+
+    pairs = zip(places, times, strict=True)
+    return [DwellEnd(p, t, hold(p), firm) if p and t > 0 else None for p, t in pairs]
 
 
 def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> Plans:

@@ -246,11 +246,9 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     for part, part_profile, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
         motions.append(PathMotion(part.curve, part.grid, part_profile))
         suffix = f", phase {phase}" if len(parts) > 1 else ""
+        nodes = zip(motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
         places = [
-            LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}")
-            for t, z in zip(
-                motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True
-            )
+            LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}") for t, z in nodes
         ]
         shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, part_profile), places)
     if not shortfalls:
@@ -429,10 +427,9 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
         amount = blocked.short * problem.scene.scales.force
         limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
         text += f": {limit} is {amount:.3g} N short at best"
+        what = PRESS, blocked.contact, limit, amount, "N"
         place = LimitPlace(phase.number, math.nan, where)
-        shortfalls.append(
-            Shortfall(PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
-        )
+        shortfalls.append(Shortfall(*what, place, blocked.short))
     else:
         text += " within the torque limits"
 
@@ -526,19 +523,15 @@ def explain_stages(
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
-    lists = [list_shortfalls(search, stages) for stages in short]
-    sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
-    best = sums.index(min(sums))
-    stages = [to_si(stage, problem) for stage in short[best]]
+    pairs = [(stages, list_shortfalls(search, stages)) for stages in short]
+    nearest, shortfalls = min(pairs, key=lambda pair: sum(one.amount for one in pair[1]))
+    stages = [to_si(stage, problem) for stage in nearest]
 
     def list_values(parameter: Parameter) -> Sequence[float] | None:
         # The limit has to be active; epsilon if no normal force is short of more than that.
         if parameter.key == EPSILON:
-            active = all(
-                shortfall.amount < parameter.value
-                for shortfall in lists[best]
-                if shortfall.kind == PRESS
-            )
+            pressing = (one for one in shortfalls if one.kind == PRESS)
+            active = all(one.amount < parameter.value for one in pressing)
         else:
             parts = [stage.guess for stage in stages]
             tables = (part.v[..., 3:] if parameter.is_speed else part.tau for part in parts)
@@ -546,7 +539,7 @@ def explain_stages(
             active = most > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
             return None
-        solution = search.aiming(Objective.RELAX, parameter).solve(short[best])
+        solution = search.aiming(Objective.RELAX, parameter).solve(nearest)
         # A limit that may be tighter is not in conflict with the others.
         if not solution.success or solution.cost < 0.0:
             return None
@@ -558,7 +551,7 @@ def explain_stages(
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    error = rank(numbers, lists[best], motion)
+    error = rank(numbers, shortfalls, motion)
     return advise(error, parameters, list_values, replan, ADVICE)
 
 

@@ -435,10 +435,8 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
         slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
         t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
         length = np.append(0.0, np.cumsum(runs))
-        c = (
-            forces.of_c[..., ONE]
-            + (forces.of_c[..., [A, B]] @ (motion @ fast.x)[..., None])[..., 0]
-        )
+        moving = np.einsum("nci,ni->nc", forces.of_c[..., [A, B]], motion @ fast.x)
+        c = forces.of_c[..., ONE] + moving
         profile = PathSpeed(t, length / length[-1], v / length[-1], c / scene.scales.force)
     return PathMargin(margin, limits.limits[int(totals.argmax())], profile)
 

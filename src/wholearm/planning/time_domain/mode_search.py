@@ -198,7 +198,7 @@ def divide(
     pieces = list[Stage]()
     for (begin, stop), mode in zip(pairwise(edges), modes, strict=True):
         count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
-        guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
+        guess = resample(stage.guess, scheme, np.linspace(begin, stop, count + 1))
         pieces.append(in_mode(replace(stage, guess=guess), mode))
     return pieces
 
@@ -211,10 +211,9 @@ def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> li
         if first == last:
             continue
         breaks = stage.guess.breaks[first : last + 1]
-        shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
-        while len(shares) - 1 < LEAST_INTERVALS:
-            shares = np.sort(np.append(shares, (shares[1:] + shares[:-1]) / 2))
-        guess = resample(stage.guess, scheme, shares, float(breaks[0]), float(breaks[-1]))
+        while len(breaks) - 1 < LEAST_INTERVALS:
+            breaks = np.sort(np.append(breaks, (breaks[1:] + breaks[:-1]) / 2))
+        guess = resample(stage.guess, scheme, breaks)
         pieces.append(in_mode(replace(stage, guess=guess), signs))
     return pieces
 

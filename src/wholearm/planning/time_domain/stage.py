@@ -319,27 +319,23 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
     return replace(stage, formation=formation, guess=points, gained=None)
 
 
-def resample(
-    part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
-) -> StagePoints:
-    """Part of a stage from `begin` to `stop`, on intervals with `breaks`, (K + 1,), in [0, 1]."""
-    span, fractions = stop - begin, np.diff(breaks)
-    inner = breaks[:-1, None] + fractions[:, None] * scheme.points
-    shape = (len(fractions), scheme.degree, -1)
-    points = _interpolate(part, scheme, (begin + span * inner).ravel())
-    nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
+def resample(part: StagePoints, scheme: Scheme, breaks: Array) -> StagePoints:
+    """Part of a stage on other intervals with `breaks`, (K + 1,), shares of its duration."""
+    lengths, (count, controls) = np.diff(breaks), part.tau.shape[:2]
+    shape = (len(lengths), scheme.degree, -1)
+    places = breaks[:-1, None] + lengths[:, None] * scheme.points
+    points = _interpolate(part, scheme, places.ravel())
+    nodes = np.stack(_interpolate(part, scheme, breaks)[:2], axis=1)
     z, v, a, forces = (table.reshape(shape) for table in points)
     # Torques of each new interval are those of the old one at its middle.
-    edges, count, controls = begin + span * breaks, *part.tau.shape[:2]
-    middles = (edges[1:] + edges[:-1]) / 2
+    middles = (breaks[1:] + breaks[:-1]) / 2
     k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
     at = np.linspace(0.0, 1.0, controls)
-    places = edges[:-1, None] + np.diff(edges)[:, None] * at
+    places = breaks[:-1, None] + lengths[:, None] * at
     x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
     tau = fit_controls(at, blend(x, controls) @ part.tau[k], controls)
-    impulses = part.impulses if stop == 1.0 else part.impulses[:0]
-    h = part.duration * span * fractions
-    return StagePoints(h, nodes, z, v, a, forces, tau, impulses)
+    impulses = part.impulses if breaks[-1] == 1.0 else part.impulses[:0]
+    return StagePoints(part.duration * lengths, nodes, z, v, a, forces, tau, impulses)
 
 
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:

@@ -493,15 +493,11 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
     rows.add_equal(tau[1:, 0], tau[:-1, -1], 1 / scene.torque_limit)
     limited = np.flatnonzero(np.isfinite(scene.torque_rate_limit))
     rates = rows.linear(K, n, len(limited), 2, high=np.inf)
-    for k, joint in enumerate(limited):
-        limit = scene.torque_limit[joint]
-        rows.add_entries(
-            rates[:, :, k], layout.h[:, None, None], scene.torque_rate_limit[joint] / limit
-        )
-        for side, sign in enumerate((1.0, -1.0)):
-            rate_rows = rates[:, :, k, side]
-            rows.add_entries(rate_rows, tau[:, 1:, joint], -sign * n / limit)
-            rows.add_entries(rate_rows, tau[:, :-1, joint], sign * n / limit)
+    limit, signs = scene.torque_limit[limited, None], np.array([1.0, -1.0])
+    most = scene.torque_rate_limit[limited, None] / limit
+    rows.add_entries(rates, layout.h[:, None, None, None], most)
+    rows.add_entries(rates, tau[:, 1:, limited, None], -signs * n / limit)
+    rows.add_entries(rates, tau[:, :-1, limited, None], signs * n / limit)
     lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
     if lagging:
         parameters = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
@@ -578,13 +574,11 @@ def hold_ends(
         rows.add_entries(rows.linear(2, low=low, high=high), friction, 1.0)
     if (first := stages[0]).phase:
         # A command approaches a torque limit only asymptotically in the pause before.
-        scene = first.formation.scene
-        for joint in np.flatnonzero(scene.actuator_lag):
-            limit = scene.torque_limit[joint]
-            fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
-            most = 1 - min(0.05, float(fastest))
-            bound = rows.linear(1, low=-most, high=most)
-            rows.add_entries(bound, layouts[0].tau[0, 0, joint], 1 / limit)
+        scene, joints = first.formation.scene, np.flatnonzero(first.formation.scene.actuator_lag)
+        limit, fastest = scene.torque_limit[joints], scene.torque_rate_limit[joints]
+        most = 1 - np.minimum(0.05, fastest * scene.actuator_lag[joints] / limit)
+        bounds = rows.linear(len(joints), low=-most, high=most)
+        rows.add_entries(bounds, layouts[0].tau[0, 0, joints], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> Flags:
