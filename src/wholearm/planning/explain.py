@@ -198,14 +198,10 @@ def find_shortfalls(
     limits: LimitSet, values: Array, places: Sequence[LimitPlace]
 ) -> list[Shortfall]:
     """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
-    violation, shortfalls = limits.fold(-limits.find_slack(values)), []
-    for k, limit in enumerate(limits.limits):
-        of_limit = violation[:, limits.owners == k].max(axis=1)
-        worst = int(of_limit.argmax())
-        amount = float(of_limit[worst])
-        if amount > 1e-4 * limit.scale:  # least violation that counts, over the scale of a limit
-            what = (limit.kind, limit.part, limit.text, amount, limit.unit)
-            shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
+    shortfalls = []
+    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least that counts
+        what = limit.kind, limit.part, limit.text, amount, limit.unit
+        shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
     return shortfalls
 
 

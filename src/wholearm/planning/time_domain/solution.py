@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -26,7 +26,7 @@ from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
 from ...mechanics.sensitivity import find_slopes_at
-from ...problem.definition import Phase, Problem
+from ...problem.definition import PARAMETERS, Phase, Problem
 from ...results.trajectory import Samples
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..refinement import CostlyError, refine
@@ -39,7 +39,6 @@ from .stage import (
     in_own_units,
     make_scheme,
     monitor,
-    scale_options,
     unit_lengths,
     unit_of,
     with_controls,
@@ -109,23 +108,20 @@ class TimeSolution(NamedTuple):
 
 @dataclass
 class TimeSearch:
-    """Data common to all solves for a plan, and their statistics.
+    """Data common to all solves for a plan, and their statistics."""
 
-    All but `source`, `phases` and `to_go` is in the scene's own units.
-    """
-
-    source: Problem  # in SI units
+    source: Problem
     phases: Sequence[Phase]  # those of the NLP
-    problem: Problem
+    problem: Problem  # in the scene's own units
     options: PlanOptions
     scheme: Scheme
-    duration: float | None  # longest duration, for the objective `margin`
+    duration: float | None  # [s]: longest duration, for the objective `margin`
     goal: Objective
-    relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
     to_go: CostToGo | None = None
-    price: Price | None = None
-    ample: float = math.inf  # normal force at which the objective `margin` saturates
+    ample: float = math.inf  # [N]: normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
+    relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
+    price: Price | None = None  # in the scene's own units
     searched: bool = False  # whether the modes of the first guess are those of a mode search
     tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
@@ -139,20 +135,10 @@ class TimeSearch:
         ample: float = math.inf,
         only_begins: bool = False,
     ) -> TimeSearch:
-        """A search with the arguments of `plan_phases`, in SI units."""
-        scales = problem.scene.scales
-        return TimeSearch(
-            problem,
-            phases or problem.phases,
-            in_own_units(problem),
-            scale_options(options, scales),
-            make_scheme(options.scheme, options.degree, options.degree),
-            None if duration is None else duration / scales.time,
-            options.goal,
-            to_go=to_go,
-            ample=ample / scales.force,
-            only_begins=only_begins,
-        )
+        """A search with the arguments of `plan_phases`."""
+        scheme = make_scheme(options.scheme, options.degree, options.degree)
+        given = phases or problem.phases, in_own_units(problem), options, scheme, duration
+        return TimeSearch(problem, *given, options.goal, to_go, ample, only_begins)
 
     @property
     def numbers(self) -> list[int]:
@@ -189,7 +175,7 @@ class TimeSearch:
     @property
     def most_margin(self) -> float:
         """Margin at which the objective saturates."""
-        return self.ample - self.problem.epsilon
+        return self.ample / self.source.scene.scales.force - self.problem.epsilon
 
     def solve(
         self,
@@ -229,7 +215,8 @@ class TimeSearch:
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
-        target = Target(self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation)
+        weight = self.options.time_weight / self.source.scene.scales.torque**2
+        target = Target(self.goal, self.problem.epsilon, weight, self.relaxation)
         most = {Objective.ELASTIC: 90, Objective.RELAX: 50}.get(self.goal, most)
         return build_time_nlp(stages, self.scheme, target, most)
 
@@ -244,7 +231,7 @@ class TimeSearch:
         """Run the solver once."""
         (low, high), (low_g, high_g) = find_bounds(nlp, stages, self.scheme, limits)
         if self.duration is not None and nlp.duration_row >= 0:
-            high_g[nlp.duration_row] = self.duration
+            high_g[nlp.duration_row] = self.duration / self.source.scene.scales.time
         if self.goal is Objective.MARGIN:
             # Solving for more than the saturated margin takes long.
             high[nlp.layouts[-1].margin[-1]] = 1.1 * self.most_margin
@@ -621,7 +608,8 @@ def find_misses(
 def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Array:
     """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
     formation, count, epsilon = stage.formation, len(check.places), search.problem.epsilon
-    ranges: Mapping[str, float] = search.options.ranges
+    ranges, length = search.options.ranges, search.source.scene.scales.length
+    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
     limits = make_limits(formation, epsilon)
     sides, total = limits.sides[0], np.zeros((count, len(limits.low)))
     names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
@@ -637,7 +625,8 @@ def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Arr
             edges = find_edges(formation, rows, name)
             if edges is not None:
                 change = change + c @ edges.T - epsilon * edges.sum(axis=1)
-            total[:, forces] += ranges[name] * np.abs(change)
+            radius = ranges[name] / (length if name in lengths else 1.0)
+            total[:, forces] += radius * np.abs(change)
     return np.asarray(total[:, sides] / limits.scales[sides])
 
 

@@ -19,9 +19,9 @@ from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import make_limits
-from ...problem.definition import PARAMETERS, Phase, Problem, Until
+from ...problem.definition import Phase, Problem, Until
 from ...scene.model import Polygon, Scales, Scene
-from ..options import CLEARANCE, OPENING, Objective, PlanOptions
+from ..options import CLEARANCE, OPENING, Objective
 
 
 class Scheme(NamedTuple):
@@ -277,16 +277,6 @@ def in_own_units(problem: Problem) -> Problem:
 def scale_state(z: Array, scales: Scales) -> Array:
     """Configurations, shape (..., 5), in own units."""
     return np.asarray(z / unit_lengths(scales))
-
-
-def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
-    """Options in own units."""
-    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
-    ranges = {
-        name: radius / scales.length if name in lengths else radius
-        for name, radius in options.ranges.items()
-    }
-    return replace(options, time_weight=options.time_weight / scales.torque**2, ranges=ranges)
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:

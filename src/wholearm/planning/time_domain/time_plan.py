@@ -560,7 +560,7 @@ def _list_slow(
 
 def _can_last(search: TimeSearch, stages: Sequence[Stage]) -> bool:
     """Whether stages, if any, keep the longest duration."""
-    lasts = sum(stage.guess.duration for stage in stages)
+    lasts = sum(stage.guess.duration for stage in stages) * search.source.scene.scales.time
     return bool(stages) and search.duration is not None and lasts <= search.duration
 
 
@@ -632,8 +632,8 @@ def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[Tim
         if search.goal is Objective.MARGIN:
             value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
         elif search.goal is Objective.EFFORT:
-            weight = search.options.time_weight * scales.torque**2
-            value = weight * motion.duration + motion.torque.integrate_squares()
+            squares = motion.torque.integrate_squares()
+            value = search.options.time_weight * motion.duration + squares
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
