@@ -677,9 +677,8 @@ class PassageTuner:
         contact of the next phase, or else of the last one, has parted.
         """
         self.simulations += 1
-        simulation = simulate_free(
-            self.problem, TorqueProfile.join_rows(make_rows(steps, end)), start=self.z
-        )
+        torque = TorqueProfile.join_rows(make_rows(steps, end))
+        simulation = simulate_free(self.problem, torque, start=self.z)
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
         pauses = [
             (last - first, name)

@@ -162,9 +162,8 @@ def plan_next(
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.coarse:
         numbers = [phase.number for phase in phases]
-        report(
-            f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}: {options.goal.value}"
-        )
+        title = f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}"
+        report(f"{title}: {options.goal.value}")
         with name_source(problem.source):
             more = planning.more.get(len(planning.blocks), 0.0)
             pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
@@ -479,10 +478,8 @@ class ImpactSequence:
     def continuous_curves(self) -> tuple[Curve, ...]:
         """The curves with such speed ratios that the speed is the same on both sides of a join."""
         ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
-        return tuple(
-            curve.with_speed_ratio(float(ratio))
-            for curve, ratio in zip(self.curves, ratios, strict=True)
-        )
+        pairs = zip(self.curves, ratios.tolist(), strict=True)
+        return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
     def plan(
         self, epsilon: float, options: PlanOptions, duration: float | None = None, **others: Any

@@ -177,6 +177,8 @@ class Plan(Drawn, Result):
 def write_meta(plan: Plan) -> dict[str, Any]:
     """All of a plan but its motion, in plain values."""
     phases, options = plan.phases, plan.options
+    of_phases = {name: [getattr(phase, name) for phase in phases] for name in _PHASES}
+    spent = {name: [getattr(each.statistics, name) for each in phases] for name in _STATISTICS}
     values: dict[str, Any] = plain(
         {
             "status": plan.status,
@@ -186,14 +188,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "value_unit": plan.unit,
             "error": plan.error,
             "epsilon": plan.problem.epsilon,
-            **{
-                _KEYS.get(name, name): [getattr(phase, name) for phase in phases]
-                for name in _PHASES
-            },
-            **{
-                _KEYS.get(name, name): [getattr(phase.statistics, name) for phase in phases]
-                for name in _STATISTICS
-            },
+            **{_KEYS.get(name, name): each for name, each in (of_phases | spent).items()},
             **{name: getattr(options, name) for name in _OPTIONS},
             "versions": plan.versions,
             "transitions": plan.transitions,

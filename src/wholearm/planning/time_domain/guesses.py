@@ -141,9 +141,8 @@ class Guesses:
                     raise InputError("", f"phases[{phase.number}].guess", text)
                 t.append(start + mode.t)
                 z.append(closed)
-        path = CubicSpline(
-            np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
-        )
+        own_t, own_z = np.array(t) / scales.time, scale_state(np.array(z), scales)
+        path = CubicSpline(own_t, own_z, bc_type="clamped")
         # Phase 19 of query 62 has no solution in given modes on the usual intervals.
         finer = (1,) if self.search.options.time_intervals else (1, 2)
         return [Guess(GIVEN, self._follow_given(path, factor)) for factor in finer]
@@ -199,16 +198,9 @@ class Guesses:
                     for x in (*inner, breaks)
                 )
                 z, v, a, _, c_n, c_t = points
-                part = StagePoints(
-                    np.full(count, span / count),
-                    np.stack(ends[:2], axis=1),
-                    z,
-                    v,
-                    a,
-                    np.concatenate([c_n, c_t[..., rolling]], axis=2),
-                    between[3],
-                    np.zeros(0),
-                )
+                h, nodes = np.full(count, span / count), np.stack(ends[:2], axis=1)
+                c = np.concatenate([c_n, c_t[..., rolling]], axis=2)
+                part = StagePoints(h, nodes, z, v, a, c, between[3], np.zeros(0))
                 signs = np.concatenate(directions)
                 signs[rolling] = 0.0
                 guess = StagePoints(*map(truediv, part, units))
@@ -643,11 +635,8 @@ def guess_stages(
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < 1e-5  # closed
             contacts = before.formation.contacts, phase.formation.contacts
             renamed = list_renamed(scene, *contacts)
-            released = tuple(
-                row
-                for row in np.flatnonzero(touching).tolist()
-                if phase.formation.limits[row].gained not in renamed
-            )
+            closed, limits = np.flatnonzero(touching).tolist(), phase.formation.limits
+            released = tuple(row for row in closed if limits[row].gained not in renamed)
         stages.append(
             Stage(
                 phase.index,
@@ -733,10 +722,8 @@ def _add_forces(
         c = np.zeros((len(G), formation.n_constraints))
         c[:, : formation.n_contacts] = _LIGHT
         missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
-        c += [
-            np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
-            for rows, short in zip(G[:, :, :3], missing, strict=True)
-        ]
+        nearest = np.linalg.pinv(G[:, :, :3].swapaxes(1, 2), rcond=1e-6)
+        c += (nearest @ missing[..., None])[..., 0]
         c_n = c[:, : formation.n_contacts]
         c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
     # Torques of the motion, within limits, at about as many points as they have control points.
@@ -744,16 +731,8 @@ def _add_forces(
     limit = 0.9 * scene.torque_limit
     tau = np.clip(tau, -limit, limit).reshape(*z.shape[:2], 2)
     tau = tau[:, np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)]
-    return StagePoints(
-        np.full(count, duration / count),
-        np.stack(follow(breaks)[:2], axis=1),
-        z,
-        v,
-        a,
-        c.reshape(*z.shape[:2], -1),
-        tau,
-        np.zeros(0),
-    )
+    h, nodes = np.full(count, duration / count), np.stack(follow(breaks)[:2], axis=1)
+    return StagePoints(h, nodes, z, v, a, c.reshape(*z.shape[:2], -1), tau, np.zeros(0))
 
 
 def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:

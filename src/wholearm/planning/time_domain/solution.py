@@ -205,10 +205,10 @@ class TimeSearch:
             solution = self.run(nlp, stages, limits, multipliers, margin)
             if raised or not solution.success:
                 return solution
-            tables = [
-                s.formation.evaluate_limits(s.guess.z.reshape(-1, 5)) for s in solution.stages
-            ]
-            stages = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
+            places = [stage.guess.z.reshape(-1, 5) for stage in solution.stages]
+            pairs = zip(solution.stages, places, strict=True)
+            least = [stage.formation.evaluate_limits(z).min(axis=0) for stage, z in pairs]
+            stages = monitor(solution.stages, least, depth)
             if stages is solution.stages:
                 return solution
             nlp, multipliers = None, None
@@ -255,18 +255,12 @@ class TimeSearch:
         stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(price.gradient @ price.origin)
-        return TimeSolution(
-            [
-                replace(stage, guess=part)
-                for stage, part in zip(stages, unpack(x, nlp.layouts), strict=True)
-            ],
-            cost,
-            -cost if self.goal is Objective.MARGIN else 0.0,
-            f"Ipopt stopped with {stats['return_status']}",
-            stats["success"],
-            nlp,
-            {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
-        )
+        pairs = zip(stages, unpack(x, nlp.layouts), strict=True)
+        solved = [replace(stage, guess=part) for stage, part in pairs]
+        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+        status = f"Ipopt stopped with {stats['return_status']}"
+        margin = -cost if self.goal is Objective.MARGIN else 0.0
+        return TimeSolution(solved, cost, margin, status, stats["success"], nlp, multipliers)
 
 
 @dataclass(frozen=True)
@@ -352,16 +346,11 @@ class TimeIterate:
         """With finer intervals, raised limits and those of the formation that are violated."""
         if self.violation <= 1 and not self.is_coarse:
             return None
+        stages = bisect_intervals(self.monitored, self.search.scheme, self.halvings)
         triples = zip(self.raised, self.misses, self.halvings, strict=True)
-        return replace(
-            self,
-            stages=bisect_intervals(self.monitored, self.search.scheme, self.halvings),
-            raised=[
-                amounts.add(miss, SETTINGS.over).halve(mine) for amounts, miss, mine in triples
-            ],
-            is_solved=False,
-            refined=self.refined + self.is_coarse,
-        )
+        raised = [limits.add(miss, SETTINGS.over).halve(mine) for limits, miss, mine in triples]
+        refined = self.refined + self.is_coarse
+        return replace(self, stages=stages, raised=raised, is_solved=False, refined=refined)
 
     def restart(self) -> None:
         """Without a solution there is no other iterate."""
@@ -387,9 +376,8 @@ class TimeIterate:
     def monitored(self) -> list[Stage]:
         """The stages with limits of their formations that are violated between points."""
         lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in self.checks]
-        return monitor(
-            self.stages, lowest, SETTINGS.graze * self.search.problem.scene.scales.length
-        )
+        depth = SETTINGS.graze * self.search.problem.scene.scales.length
+        return monitor(self.stages, lowest, depth)
 
     @cached_property
     def gains(self) -> list[Array]:

@@ -29,8 +29,9 @@ class Scheme(NamedTuple):
 
     name: str
     points: Array  # (d,): increasing
-    integrals: Array  # (d, d): row j integrates the interpolating polynomial from 0 to point j
-    weights: Array  # (d,): the same from 0 to 1
+    # (d, d) or (d + 1, d): each row integrates the interpolating polynomial from 0 to a point, the
+    # last one to 1, whether that is a point or not
+    rungs: Array
     order: int  # of the error at the end of an interval
     controls: int  # number of control points of the torques in an interval
 
@@ -43,11 +44,6 @@ class Scheme(NamedTuple):
     def ends(self) -> bool:
         """Whether the last point is the end of the interval."""
         return bool(self.points[-1] == 1.0)
-
-    @property
-    def rungs(self) -> Array:
-        """Rows of the integrals to every point, and to the end if no point is there."""
-        return self.integrals if self.ends else np.vstack([self.integrals, self.weights])
 
     def interpolate(self, places: Array) -> Array:
         """Values at `places`, shape (n,), from those at the points: a matrix of shape (n, d)."""
@@ -79,15 +75,12 @@ def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     Zeros of P_d - P_d-1, 1 among them, or of P_d (E. Hairer and G. Wanner, Solving Ordinary
     Differential Equations II, section IV.5). `controls` are control points of torques.
     """
-    if name == "radau":
-        points = (np.append(jacobi_nodes(degree - 1, 1, 0), 1.0) + 1) / 2
-    else:
-        points = (jacobi_nodes(degree) + 1) / 2
-    powers = np.arange(1, degree + 1)
-    invert = np.linalg.inv(points[:, None] ** (powers - 1))
-    integrals = (points[:, None] ** powers / powers) @ invert
-    order = 2 * degree - (name == "radau")
-    return Scheme(name, points, integrals, (1 / powers) @ invert, order, controls)
+    radau, powers = name == "radau", np.arange(1, degree + 1)
+    inner = jacobi_nodes(degree - 1, 1, 0) if radau else jacobi_nodes(degree)
+    ends = np.append((inner + 1) / 2, 1.0)
+    points = ends[:degree]
+    rungs = (ends[:, None] ** powers / powers) @ np.linalg.inv(points[:, None] ** (powers - 1))
+    return Scheme(name, points, rungs, 2 * degree - radau, controls)
 
 
 class StagePoints(NamedTuple):
@@ -195,9 +188,7 @@ class Stage:
         """
         slow = self.formation.scene.has_slow_motors
         late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
-        released, apart = (
-            np.isin(self.monitored, limits) for limits in (self.released, self.apart)
-        )
+        released, apart = (np.isin(self.monitored, k) for k in (self.released, self.apart))
         opened = np.where(self.opens, late, 1.0)
         return np.asarray(self.clearance * np.maximum(released * opened, apart * late))
 

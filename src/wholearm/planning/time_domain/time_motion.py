@@ -199,10 +199,9 @@ class TimeMotion:
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             formation, (Xi, sigma) = stage.formation, stage.directions
             rolls = formation.rolling_rows
-            contacts = {
-                name: ROLLS if k in rolls else "+" if Xi[k] > 0 else "-"
-                for k, name in enumerate(formation.names)
-            }
+            slides = ("+" if xi > 0 else "-" for xi in Xi)
+            modes = [ROLLS if k in rolls else sign for k, sign in enumerate(slides)]
+            contacts = dict(zip(formation.names, modes, strict=True))
             joints = tuple("+" if sign > 0 else "-" for sign in sigma)
             spans.append(ModeSpan(start, start + stage.duration, contacts, joints))
         return tuple(spans)

@@ -98,12 +98,12 @@ def lay_out(
         # In elastic mode every limit but those of speeds has a shortfall in each interval.
         soft = make_limits(formation, target.epsilon).without(SPEED).limits
         short = len(soft) * (target.objective is Objective.ELASTIC)
-        points = d * (15 + formation.n_constraints)
+        width = d * (15 + formation.n_constraints)
         begins = held and (not k or stages[k - 1].rests)
         begin = take((2 * formation.n_contacts + 2) * begins)
         first, first_margin = take(10), take(with_margin)
         interval = Columns(
-            h=1, tau=2 * m, points=points, end=10 * (not scheme.ends), short=short, m=with_margin
+            h=1, tau=2 * m, points=width, end=10 * (not scheme.ends), short=short, m=with_margin
         )
         table = take(K, interval.count)
         at = {name: table[:, part] for name, part in interval.slices.items()}
@@ -111,22 +111,12 @@ def lay_out(
         z, v, a, forces = np.split(of_points, [5, 10, 15], axis=2)
         ends = of_points[:, -1, :10] if scheme.ends else at["end"]
         jumps = stage.ends_in_impact and k + 1 < len(stages)
-        layouts.append(
-            StageLayout(
-                at["h"][:, 0],
-                np.vstack([first, ends]).reshape(K + 1, 2, 5),
-                z,
-                v,
-                a,
-                forces,
-                at["tau"].reshape(K, m, 2),
-                impulses=take(stages[k + 1].formation.n_constraints if jumps else 0),
-                margin=np.vstack([first_margin, at["m"]]),
-                short=at["short"],
-                begin=begin,
-                finish=take((2 * stage.ending.n_contacts + 2) * (held and stage.rests)),
-            )
-        )
+        nodes, tau = np.vstack([first, ends]).reshape(K + 1, 2, 5), at["tau"].reshape(K, m, 2)
+        impulses = take(stages[k + 1].formation.n_constraints if jumps else 0)
+        margin = np.vstack([first_margin, at["m"]])
+        finish = take((2 * stage.ending.n_contacts + 2) * (held and stage.rests))
+        points = at["h"][:, 0], nodes, z, v, a, forces, tau, impulses
+        layouts.append(StageLayout(*points, margin, at["short"], begin, finish))
     return layouts
 
 

@@ -52,7 +52,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, in_own_units, make_scheme, resample, to_si, unit_of, with_controls
+from .stage import Scheme, Stage, make_scheme, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -142,11 +142,9 @@ def plan_phases(
             listed = chain(guesses.every(), _free_ends(search, guesses), others)
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
-        solution = solve_guesses(
-            search,
-            chain(guesses.list_given(), listed),
-            lambda: refuse(search, guesses.nearest.stages, explanation),
-        )
+        listed = chain(guesses.list_given(), listed)
+        why = partial(refuse, search, guesses.nearest.stages, explanation)
+        solution = solve_guesses(search, listed, why)
     if solution is None and _can_last(search, stages):
         raise SolverError(
             f"no plan for {name_phases(search.numbers)}: the solver did not converge for the "
@@ -569,35 +567,19 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
     Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
     """
-    scaled_phases = search.problem.phases
-    if not any(_set_free(phase) is not phase for phase in search.phases):
+    pinned = [phase.until.pins for phase in search.phases if phase.formation.n_constraints < 4]
+    if not any(pinned):
         return
-    problem = replace(search.source, phases=tuple(map(_set_free, search.source.phases)))
-    phases = [problem.phases[phase.index] for phase in search.phases]
-    free_search = replace(
-        search,
-        source=problem,
-        phases=phases,
-        problem=in_own_units(problem),
-        only_begins=True,
-        to_go=None,
-        price=None,
-    )
+    free = tuple(replace(p, until=replace(p.until, pins=())) for p in search.source.phases)
+    problem, phases = replace(search.source, phases=free), [free[p.index] for p in search.phases]
+    given = search.options, phases, search.duration, None, search.ample, True
+    free_search = replace(TimeSearch.of(problem, *given), tried=search.tried)
     coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
     if coarse is None:
         return
-    stages = [
-        replace(stage, goal=stage.goal and scaled_phases[stage.phase].until)
-        for stage in coarse.stages
-    ]
+    own = search.problem.phases
+    stages = [replace(each, goal=each.goal and own[each.phase].until) for each in coarse.stages]
     yield Guess("a plan that chooses where it ends", link(stages))
-
-
-def _set_free(phase: Phase) -> Phase:
-    """The phase without pins; unchanged where they have no effect."""
-    if not phase.until.pins or phase.formation.n_constraints >= 4:
-        return phase
-    return replace(phase, until=replace(phase.until, pins=()))
 
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
