@@ -378,11 +378,8 @@ def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions)
 
 def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
     """Estimated least time [s] of a phase with one freedom, as a function of where it begins."""
-
-    def value(z: Array) -> float:
-        return ImpactSequence([phase], [trace_phase(phase, z)]).estimate(epsilon)
-
-    return CostToGo(phase, value)
+    sequence = partial(ImpactSequence, [phase])
+    return CostToGo(phase, lambda z: sequence([trace_phase(phase, z)]).estimate(epsilon))
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
@@ -394,13 +391,12 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
         if getattr(finger, key) != free
     ]
     scene, why = problem.scene, ""
-    if scene.control_period:
-        if options.ranges:
-            why = "ranges (--robust) are not kept with it yet"
-        elif settings and scene.control_hold == "constant":
-            why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
-        if why:
-            raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
+    if options.ranges:
+        why = "ranges (--robust) are not kept with it yet"
+    elif settings and scene.control_hold == "constant":
+        why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
+    if why and scene.control_period:
+        raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
     along = all(runs_along_curves(block, options) for block in split_blocks(problem))
     if settings and options.ranges and not along:
         why = "ranges (--robust) are not kept with it in phases over time yet"

@@ -251,15 +251,9 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
         last, left = int(still[-1]) + 1 if len(still) else 0, float(gaps[-1])
         closes = float(run.t[last]) if last < len(run.t) else None
     name, text = place.gained.name, f"that hold the end of phase {phase.number}"
-    return settling._replace(
-        contact=name,
-        gap=problem.gap,
-        closes=closes,
-        left=left,
-        speed=hold.speed,
-        parts=hold.parts,
-        warning="" if hold.speed or firm else f"no torques {text} would drive it on to {name}",
-    )
+    text = "" if hold.speed or firm else f"no torques {text} would drive it on to {name}"
+    settling = settling._replace(speed=hold.speed, parts=hold.parts, warning=text)
+    return settling._replace(contact=name, gap=problem.gap, closes=closes, left=left)
 
 
 # Dwell times of the first end that gains a contact and of the plan's last end, over those of the

@@ -174,11 +174,9 @@ def change_scene(scene: Scene, key: str, value: float) -> Scene:
     if where == FRICTION:
         return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
     change: Any = {names[1]: value}
-    right, left = (
-        replace(link, **change) if f"{k + 1}" == names[0] else link
-        for k, link in enumerate(scene.fingers)
-    )
-    return replace(scene, fingers=(right, left))
+    fingers = dict(zip("12", scene.fingers, strict=True))
+    fingers[names[0]] = replace(fingers[names[0]], **change)
+    return replace(scene, fingers=(fingers["1"], fingers["2"]))
 
 
 def change_curve(curve: Curve, key: str, value: float) -> Curve:
@@ -229,11 +227,9 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
     short += 0.05 * data.limits.scales
     nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, Objective.ELASTIC)
-    result = nlp.solver(
-        x0=pack(nlp, profile, units, short / units.of(data.limits)),
-        p=parameters(nlp, data, units, 1.0),
-        **make_bounds(nlp, data, units, Tightening.none(data, None)),
-    )
+    x0 = pack(nlp, profile, units, short / units.of(data.limits))
+    bounds = make_bounds(nlp, data, units, Tightening.none(data, None))
+    result = nlp.solver(x0=x0, p=parameters(nlp, data, units, 1.0), **bounds)
     if not nlp.solver.stats()["success"]:
         return SolverError(stopped)
     elastic, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
@@ -398,21 +394,18 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
         if blocked := statics.find_block(epsilon, ends=node == -1):
             break
     else:
-        first = stages[0].formation
+        first, text = stages[0].formation, ""
         names = " ".join(first.names)
         z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
         if alone and [contact.finger for contact in first.contacts] == [None, None]:
-            raise InfeasibleError(
-                f"phase {phase.number} is infeasible: no finger drives the object on {names}, and "
-                "it stays at rest; add a contact with a finger"
-            )
-        if alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+            text = f"no finger drives the object on {names}, and it stays at rest; add a contact "
+            text += "with a finger"
+        elif alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+            text = f"{names} can only push the object one way, with whatever friction, so that it "
             where = describe_pose(to_si(last, problem).guess.nodes[-1, 0])
-            raise InfeasibleError(
-                f"phase {phase.number} is infeasible: {names} can only push the "
-                "object one way, with whatever friction, so that it does not come to rest at its "
-                f"end, {where}"
-            )
+            text += f"does not come to rest at its end, {where}"
+        if text:
+            raise InfeasibleError(f"phase {phase.number} is infeasible: {text}")
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     none = f"at its end, {where}, no motion comes to rest"
@@ -565,10 +558,8 @@ def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfa
         tau = blend(at, part.tau.shape[1]) @ part.tau
         y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
         middles = passed + np.cumsum(part.h) - part.h / 2
-        places = [
-            LimitPlace(stage.phase + 1, t, f"t = {t:.4f} s, phase {stage.phase + 1}")
-            for t in np.repeat(middles, len(pick)).tolist()
-        ]
+        number, times = stage.phase + 1, np.repeat(middles, len(pick)).tolist()
+        places = [LimitPlace(number, t, f"t = {t:.4f} s, phase {number}") for t in times]
         values = (y @ limits.rows.T).reshape(-1, len(limits.low))
         for short in find_shortfalls(limits, values, places):
             worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)

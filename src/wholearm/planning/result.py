@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import reduce
@@ -255,30 +255,20 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             key = _KEYS.get(name, name)
             raise InputError("", key, f"{len(values)} values given, {count} needed")
 
-    def read_phase(k: int) -> PlannedPhase:
-        entries = {name: values[k] for name, values in stored.items() if name in _PHASES}
-        spent = {name: values[k] for name, values in stored.items() if name in _STATISTICS}
-        phase: PlannedPhase = restore(
-            PlannedPhase, {"number": k + 1, "statistics": spent, **entries}
-        )
-        return phase
+    def pick(names: Sequence[str], k: int) -> dict[str, Any]:
+        return {name: values[k] for name, values in stored.items() if name in names}
 
-    phases = tuple(map(read_phase, range(count)))
-    replay, timings = meta.get("replay"), meta.get("timings", {})
-    return Plan(
-        problem,
-        options,
-        Status(meta["status"]),
-        float(meta["value"]),
-        trajectory,
-        phases,
-        restore(tuple[Transition, ...], meta.get("transitions", ())),
-        None if replay is None else _read_replay(replay),
-        Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
-        dict(meta.get("versions", {})),
-        restore(Certificate | None, meta.get("certificate")),
-        restore(RangeFigures | None, meta.get("ranges")),
-    )
+    entries = [pick(_PHASES, k) | {"statistics": pick(_STATISTICS, k)} for k in range(count)]
+    numbered = [{"number": number, **entry} for number, entry in enumerate(entries, start=1)]
+    phases = restore(tuple[PlannedPhase, ...], numbered)
+    status, replay, spent = Status(meta["status"]), meta.get("replay"), meta.get("timings", {})
+    transitions = restore(tuple[Transition, ...], meta.get("transitions", ()))
+    figures = None if replay is None else _read_replay(replay)
+    timings = Timings(*(float(spent.get(name, 0.0)) for name in Timings._fields))
+    plan = problem, options, status, float(meta["value"]), trajectory, phases, transitions, figures
+    certificate = restore(Certificate | None, meta.get("certificate"))
+    ranges = restore(RangeFigures | None, meta.get("ranges"))
+    return Plan(*plan, timings, dict(meta.get("versions", {})), certificate, ranges)
 
 
 def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None = None) -> Document:

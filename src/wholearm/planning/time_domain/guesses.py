@@ -95,8 +95,6 @@ class Guess(NamedTuple):
     def from_rest(self) -> Guess:
         """The same with a start at rest: plans of a block without stops pass there at speed."""
         first, *others = self.stages
-        if np.abs(first.guess.nodes[0, 1]).max() < 1e-9:  # rounding
-            return self
         return self._replace(stages=[first.begin_at(first.guess.nodes[0, 0], np.zeros(5)), *others])
 
     def by_homotopy(self) -> Guess:
@@ -209,17 +207,12 @@ class Guesses:
 
     def without_stops(self, plans: Sequence[PhasePlan[Motion]]) -> Guess:
         """Along plans of the phases, each of them from rest to rest."""
-        stages = [
-            replace(
-                stage,
-                phase=own.phase,
-                goal=own.goal,
-                released=own.released,
-                monitored=tuple(sorted({*stage.monitored, *own.released})),
-            )
-            for own, plan in zip(join_modes(self.nearest.stages), plans, strict=True)
-            for stage in list_stages([plan])
-        ]
+        stages = list[Stage]()
+        for own, plan in zip(join_modes(self.nearest.stages), plans, strict=True):
+            given: Any = {"phase": own.phase, "goal": own.goal, "released": own.released}
+            for stage in list_stages([plan]):
+                monitored = tuple(sorted({*stage.monitored, *own.released}))
+                stages.append(replace(stage, monitored=monitored, **given))
         return self.resume("a motion with stops between the phases", link(stages))
 
     def straight(self, goal: Array) -> Guess | None:

@@ -335,9 +335,8 @@ def list_neighbours(
     """
     stages, scheme, epsilon = solution.stages, search.scheme, search.problem.epsilon
     formations = [search.problem.phases[stage.phase].formation for stage in stages]
-    slides = [
-        _find_leaning(stage, scheme, formations[k], epsilon) for k, stage in enumerate(stages)
-    ]
+    pairs = zip(stages, formations, strict=True)
+    slides = [_find_leaning(stage, scheme, own, epsilon) for stage, own in pairs]
 
     def turn(index: int, run: ModeRun) -> list[Stage] | None:
         """Another mode over a run: rolling if possible, else reversed."""

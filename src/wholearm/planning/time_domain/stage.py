@@ -382,9 +382,8 @@ def _find_excess(stage: Stage) -> float:
     Goal 52 of the corpus lands past a fingertip without it, and takes 6 % longer.
     """
     until, formation = stage.until, stage.formation
-    if until is None or until.contact is None:
-        return 0.0
-    if 5 - formation.n_constraints - len(until.pins) < 2:
+    pins = 0 if until is None else len(until.pins)
+    if until is None or until.contact is None or 5 - formation.n_constraints - pins < 2:
         return 0.0
     texts, gained = {limit.text for limit in formation.limits}, formation.add(until.contact)
     values = gained.evaluate_limits(stage.guess.nodes[-1:, 0])[0].tolist()
