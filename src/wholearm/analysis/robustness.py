@@ -230,7 +230,7 @@ class Trial:
                 pauses = simulation.list_pauses(name, began, stop, aliases[name])
                 closed = began + MOMENT * unit if pauses and pauses[0][0] <= began else began
                 long = [pause for pause in pauses if pause[1] - pause[0] > 1e-3 * unit]
-                losses += [(one, phase.number, name) for one, after in long if after > closed]
+                losses += [(first, phase.number, name) for first, after in long if after > closed]
             began = max(planned, gain) if gained else planned
             if began > t[-1]:
                 # What ends the whole motion may be a little short: that is for the goal to say.

@@ -135,7 +135,7 @@ class LimitSet:
         """Limits that rows y, (n, m), miss by `least` of their scale: how much, and where."""
         violation, owners = -self.find_slack(values), self.owners[self.sides[0]]
         for k, limit in enumerate(self.limits):
-            amounts = violation[:, owners == k].max(axis=1)
+            amounts = violation[:, owners == k].max(axis=1, initial=-np.inf)
             worst = int(amounts.argmax())
             if amounts[worst] > least * limit.scale:
                 yield limit, float(amounts[worst]), worst

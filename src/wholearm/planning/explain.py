@@ -197,7 +197,7 @@ def find_shortfalls(
 ) -> list[Shortfall]:
     """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
     shortfalls = []
-    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least that counts
+    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least miss that counts
         what = limit.kind, limit.part, limit.text, amount, limit.unit
         shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
     return shortfalls
@@ -408,9 +408,9 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
             raise InfeasibleError(f"phase {phase.number} is infeasible: {text}")
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
-    none = f"at its end, {where}, no motion comes to rest"
-    none = none if node else f"from rest at its start, {where}, no motion begins"
-    text = f"phase {phase.number} is infeasible: {none} in any contact mode"
+    fails = "no motion comes to rest" if node else "no motion begins"
+    at = "at its end" if node else "from rest at its start"
+    text = f"phase {phase.number} is infeasible: {at}, {where}, {fails} in any contact mode"
     shortfalls = list[Shortfall]()
     if blocked.contact:
         amount = blocked.short * problem.scene.scales.force

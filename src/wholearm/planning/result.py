@@ -38,7 +38,7 @@ _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ra
 """Options that stand in `meta` by themselves."""
 
 
-_DEVIATIONS = ("end_deviation", "deviation")
+_DEVIATIONS = ("end_deviation", "deviation")  # keys of a replayed phase
 
 
 class Status(Enum):

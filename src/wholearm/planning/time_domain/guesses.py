@@ -514,7 +514,7 @@ def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
     modes = [tuple(signs)]
     for _, new in changes:
         modes.append(tuple(new.get(row, sign) for row, sign in enumerate(modes[-1])))
-    return divide(stage, scheme, edges, modes)
+    return [*divide(stage, scheme, edges, modes)]
 
 
 def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Change]]:

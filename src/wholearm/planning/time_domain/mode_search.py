@@ -193,14 +193,12 @@ def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[S
 
 def divide(
     stage: Stage, scheme: Scheme, edges: Sequence[float], modes: Sequence[Mode]
-) -> list[Stage]:
+) -> Iterator[Stage]:
     """Pieces of a stage between `edges`, shares of it, with a mode each, to be linked."""
-    pieces = list[Stage]()
     for (begin, stop), mode in zip(pairwise(edges), modes, strict=True):
         count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
         guess = resample(stage.guess, scheme, np.linspace(begin, stop, count + 1))
-        pieces.append(in_mode(replace(stage, guess=guess), mode))
-    return pieces
+        yield in_mode(replace(stage, guess=guess), mode)
 
 
 def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> list[Stage]:

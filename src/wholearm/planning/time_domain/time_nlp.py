@@ -98,13 +98,11 @@ def lay_out(
         # In elastic mode every limit but those of speeds has a shortfall in each interval.
         soft = make_limits(formation, target.epsilon).without(SPEED).limits
         short = len(soft) * (target.objective is Objective.ELASTIC)
-        width = d * (15 + formation.n_constraints)
+        width, end = d * (15 + formation.n_constraints), 10 * (not scheme.ends)
         begins = held and (not k or stages[k - 1].rests)
         begin = take((2 * formation.n_contacts + 2) * begins)
         first, first_margin = take(10), take(with_margin)
-        interval = Columns(
-            h=1, tau=2 * m, points=width, end=10 * (not scheme.ends), short=short, m=with_margin
-        )
+        interval = Columns(h=1, tau=2 * m, points=width, end=end, short=short, m=with_margin)
         table = take(K, interval.count)
         at = {name: table[:, part] for name, part in interval.slices.items()}
         of_points = at["points"].reshape(K, d, -1)
