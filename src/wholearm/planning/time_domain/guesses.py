@@ -715,8 +715,8 @@ def _add_forces(
         c = np.zeros((len(G), formation.n_constraints))
         c[:, : formation.n_contacts] = _LIGHT
         missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
-        nearest = np.linalg.pinv(G[:, :, :3].swapaxes(1, 2), rcond=1e-6)
-        c += (nearest @ missing[..., None])[..., 0]
+        pairs = zip(G[:, :, :3], missing, strict=True)
+        c += [np.linalg.lstsq(rows.T, short, rcond=1e-6)[0] for rows, short in pairs]
         c_n = c[:, : formation.n_contacts]
         c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
     # Torques of the motion, within limits, at about as many points as they have control points.
