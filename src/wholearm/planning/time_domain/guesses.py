@@ -72,6 +72,7 @@ class Guess(NamedTuple):
     name: str
     stages: list[Stage]
     homotopy: bool = False  # whether its modes come from the friction homotopy
+    before: TimeSolution | None = None  # solution that the stages are from
 
     def end_at(self, z: Array, problem: Problem) -> Guess:
         """The same with a given end, shape (5,).
@@ -95,6 +96,8 @@ class Guess(NamedTuple):
     def from_rest(self) -> Guess:
         """The same with a start at rest: plans of a block without stops pass there at speed."""
         first, *others = self.stages
+        if np.abs(first.guess.nodes[0, 1]).max() < 1e-9:  # rounding
+            return self
         return self._replace(stages=[first.begin_at(first.guess.nodes[0, 0], np.zeros(5)), *others])
 
     def by_homotopy(self) -> Guess:

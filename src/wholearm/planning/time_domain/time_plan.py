@@ -327,7 +327,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         if not solution.success:
             return solution
         stages, most = solution.stages, 80  # most iterations in modes of the homotopy
-    solution = search.solve(stages, most=most)
+    solution = search.solve(stages, guess.before, most)
     if solution.success and solution.margin < -5e-7:  # rounding
         # A motion that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
@@ -579,7 +579,9 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         return
     own = search.problem.phases
     stages = [replace(each, goal=each.goal and own[each.phase].until) for each in coarse.stages]
-    yield Guess("a plan that chooses where it ends", link(stages))
+    moved = search.solve(link(stages), coarse, ITERATIONS)
+    if moved.success:
+        yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
