@@ -382,7 +382,7 @@ def test_equations_of_motion_hold_and_contacts_are_closed_at_any_instant(
 
 def test_velocities_are_derivatives(stages: list[StageMotion]) -> None:
     for stage in stages:
-        t, h = instants(stage, 10), 1e-3 * stage.duration / len(stage.points.fractions)
+        t, h = instants(stage, 10), 1e-3 * stage.duration / len(stage.points.h)
         around = [stage.evaluate(t + k * h) for k in (-2, -1, 1, 2)]
         weights = np.array([1, -8, 8, -1]) / (12 * h)
         z_dot = np.tensordot(weights, [part.z for part in around], 1)
@@ -725,7 +725,7 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     # No interval is halved for ever, and neither phase shrinks to nothing.
     motions = [motion for motion in plan.motions if isinstance(motion, TimeMotion)]
     stages = [stage for motion in motions for stage in motion.stages]
-    assert sum(len(stage.points.fractions) for stage in stages) <= 2 * SETTINGS.intervals
+    assert sum(len(stage.points.h) for stage in stages) <= 2 * SETTINGS.intervals
     assert min(motion.duration for motion in plan.motions) > 0.1 * plan.duration
     # What rolls does so all along; what slides has friction against its motion.
     for motion, rolls in zip(motions, (False, True), strict=True):

@@ -119,8 +119,7 @@ def drive(
         shape = (count, scheme.degree, -1)
         ends = np.array([[torque(t) for t in pair] for pair in pairwise(breaks)])
         return StagePoints(
-            duration,
-            np.full(count, 1 / count),
+            np.full(count, duration / count),
             run.sol(breaks).T.reshape(-1, 2, 5),
             states[:, :5].reshape(shape),
             states[:, 5:].reshape(shape),

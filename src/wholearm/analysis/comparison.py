@@ -163,6 +163,8 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         return replace(contender, reason=str(error))
     least, number = report.least_force
     energy, end = report.energy, report.phases[-1].arrival
+    spans = [(phase.start, phase.arrival) for phase in report.phases]
+    forces = [phase.least_force for phase in report.phases]
     return replace(
         contender,
         ok=report.ok,
@@ -172,13 +174,7 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         contact="" if least is None else least.contact,
         phase=number,
         lost=energy.viscous + energy.dry + energy.contact + energy.impact,
-        lasts=tuple(
-            math.nan if phase.arrival is None else phase.arrival - phase.start
-            for phase in report.phases
-        ),
-        margins=tuple(
-            math.nan if force is None else force.margin
-            for force in (phase.least_force for phase in report.phases)
-        ),
+        lasts=tuple(math.nan if t is None else t - start for start, t in spans),
+        margins=tuple(math.nan if force is None else force.margin for force in forces),
         report=report,
     )

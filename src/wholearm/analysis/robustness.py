@@ -228,11 +228,8 @@ class Trial:
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))
                 pauses = simulation.list_pauses(name, began, stop, aliases[name])
                 closed = began + MOMENT * unit if pauses and pauses[0][0] <= began else began
-                losses += [
-                    (first, phase.number, name)
-                    for first, after in pauses
-                    if after > closed and after - first > 1e-3 * unit
-                ]
+                long = [pause for pause in pauses if pause[1] - pause[0] > 1e-3 * unit]
+                losses += [(first, phase.number, name) for first, after in long if after > closed]
             began = max(planned, gain) if gained else planned
             if began > t[-1]:
                 # What ends the whole motion may be a little short: that is for the goal to say.

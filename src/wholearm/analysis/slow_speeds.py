@@ -99,9 +99,8 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
     speed, profiles = require_number(speed, "speed", positive=True), []
     for phase in prediction.phases:
         if phase.torques is None:
-            raise InfeasibleError(
-                f"no quasistatic torques to write: phase {phase.number} is not kept all along"
-            )
+            text = f"phase {phase.number} is not kept all along"
+            raise InfeasibleError(f"no quasistatic torques to write: {text}")
         rows = np.column_stack([phase.torques.s / speed, phase.torques.tau])
         profiles.append(TorqueProfile.join_rows(rows))
     return TorqueProfile.chain(profiles)

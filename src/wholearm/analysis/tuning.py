@@ -455,10 +455,8 @@ class PassageTuner:
         if balance is None:
             return [None]
         (first, second), acting = balance[0][0].tolist(), balance[1]
-        lowered = [
-            (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
-            for n in range(1, SETTINGS.hold)
-        ]
+        factors = [FACTOR**n for n in range(1, SETTINGS.hold)]
+        lowered = [(first / f, second) if acting == 0 else (first, second / f) for f in factors]
         arrived, held = np.array(trial.steps[-1].tau), []
         if after is None:
             arrived[1 - acting] /= FACTOR**SETTINGS.hold
@@ -677,16 +675,12 @@ class PassageTuner:
         contact of the next phase, or else of the last one, has parted.
         """
         self.simulations += 1
-        simulation = simulate_free(
-            self.problem, TorqueProfile.join_rows(make_rows(steps, end)), start=self.z
-        )
+        torque = TorqueProfile.join_rows(make_rows(steps, end))
+        simulation = simulate_free(self.problem, torque, start=self.z)
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
-        pauses = [
-            (last - first, name)
-            for name in names
-            for first, last in simulation.list_pauses(name, arrival, end)
-        ]
-        longest, worst = max(pauses, key=lambda pause: pause[0], default=(0.0, ""))
+        pauses = [(name, simulation.list_pauses(name, arrival, end)) for name in names]
+        spans = [(last - first, name) for name, each in pauses for first, last in each]
+        longest, worst = max(spans, key=lambda span: span[0], default=(0.0, ""))
         if longest > REST_WINDOW * self.time:
             reason = f"{worst} parts for {1e3 * longest:.3g} ms"
         elif simulation.z_dot[-1].any() or simulation.t[-1] != end:

@@ -10,7 +10,7 @@ go through a `LimitSet`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -130,6 +130,15 @@ class LimitSet:
         for k, row in enumerate(self.sides[0]):
             folded[..., row] = np.maximum(folded[..., row], of_sides[..., k])
         return folded
+
+    def list_misses(self, values: Array, least: float) -> Iterator[tuple[MotionLimit, float, int]]:
+        """Limits that rows y, (n, m), miss by `least` of their scale: how much, and where."""
+        violation, owners = -self.find_slack(values), self.owners[self.sides[0]]
+        for k, limit in enumerate(self.limits):
+            amounts = violation[:, owners == k].max(axis=1, initial=-np.inf)
+            worst = int(amounts.argmax())
+            if amounts[worst] > least * limit.scale:
+                yield limit, float(amounts[worst]), worst
 
     @property
     def parameters(self) -> list[Parameter]:

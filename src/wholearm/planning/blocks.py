@@ -162,9 +162,8 @@ def plan_next(
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.coarse:
         numbers = [phase.number for phase in phases]
-        report(
-            f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}: {options.goal.value}"
-        )
+        title = f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}"
+        report(f"{title}: {options.goal.value}")
         with name_source(problem.source):
             more = planning.more.get(len(planning.blocks), 0.0)
             pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
@@ -379,11 +378,8 @@ def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions)
 
 def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
     """Estimated least time [s] of a phase with one freedom, as a function of where it begins."""
-
-    def value(z: Array) -> float:
-        return ImpactSequence([phase], [trace_phase(phase, z)]).estimate(epsilon)
-
-    return CostToGo(phase, value)
+    sequence = partial(ImpactSequence, [phase])
+    return CostToGo(phase, lambda z: sequence([trace_phase(phase, z)]).estimate(epsilon))
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
@@ -395,13 +391,12 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
         if getattr(finger, key) != free
     ]
     scene, why = problem.scene, ""
-    if scene.control_period:
-        if options.ranges:
-            why = "ranges (--robust) are not kept with it yet"
-        elif settings and scene.control_hold == "constant":
-            why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
-        if why:
-            raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
+    if options.ranges:
+        why = "ranges (--robust) are not kept with it yet"
+    elif settings and scene.control_hold == "constant":
+        why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
+    if why and scene.control_period:
+        raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
     along = all(runs_along_curves(block, options) for block in split_blocks(problem))
     if settings and options.ranges and not along:
         why = "ranges (--robust) are not kept with it in phases over time yet"
@@ -479,10 +474,8 @@ class ImpactSequence:
     def continuous_curves(self) -> tuple[Curve, ...]:
         """The curves with such speed ratios that the speed is the same on both sides of a join."""
         ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
-        return tuple(
-            curve.with_speed_ratio(float(ratio))
-            for curve, ratio in zip(self.curves, ratios, strict=True)
-        )
+        pairs = zip(self.curves, ratios.tolist(), strict=True)
+        return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
     def plan(
         self, epsilon: float, options: PlanOptions, duration: float | None = None, **others: Any
@@ -526,11 +519,8 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
     if block_before is not None:
-        before = (
-            block_before.chain.curves[-1]
-            if block_before.chain
-            else block_before.plans[-1].end_torques[1]
-        )
+        chain, last_plan = block_before.chain, block_before.plans[-1]
+        before = chain.curves[-1] if chain else last_plan.end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     beyond: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):

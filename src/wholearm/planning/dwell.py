@@ -201,15 +201,13 @@ def find_ends(
     firm: bool = False,
 ) -> list[DwellEnd | None]:
     """Dwells of given times [s] at ends at rest; None for all others."""
-    ends = list[DwellEnd | None]()
-    for place, time in zip(places, times, strict=True):
-        if place is None or time <= 0:
-            ends.append(None)
-            continue
+
+    def hold(place: Standstill) -> Hold | None:
         goal = place._replace(gained=None) if firm else place
-        hold = find_hold(goal, problem.epsilon, problem.gap)
-        ends.append(DwellEnd(place, time, hold, firm))
-    return ends
+        return find_hold(goal, problem.epsilon, problem.gap)
+
+    pairs = zip(places, times, strict=True)
+    return [DwellEnd(p, t, hold(p), firm) if p and t > 0 else None for p, t in pairs]
 
 
 def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> Plans:
@@ -253,15 +251,9 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
         last, left = int(still[-1]) + 1 if len(still) else 0, float(gaps[-1])
         closes = float(run.t[last]) if last < len(run.t) else None
     name, text = place.gained.name, f"that hold the end of phase {phase.number}"
-    return settling._replace(
-        contact=name,
-        gap=problem.gap,
-        closes=closes,
-        left=left,
-        speed=hold.speed,
-        parts=hold.parts,
-        warning="" if hold.speed or firm else f"no torques {text} would drive it on to {name}",
-    )
+    text = "" if hold.speed or firm else f"no torques {text} would drive it on to {name}"
+    settling = settling._replace(speed=hold.speed, parts=hold.parts, warning=text)
+    return settling._replace(contact=name, gap=problem.gap, closes=closes, left=left)
 
 
 # Dwell times of the first end that gains a contact and of the plan's last end, over those of the

@@ -174,11 +174,9 @@ def change_scene(scene: Scene, key: str, value: float) -> Scene:
     if where == FRICTION:
         return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
     change: Any = {names[1]: value}
-    right, left = (
-        replace(link, **change) if f"{k + 1}" == names[0] else link
-        for k, link in enumerate(scene.fingers)
-    )
-    return replace(scene, fingers=(right, left))
+    fingers = dict(zip("12", scene.fingers, strict=True))
+    fingers[names[0]] = replace(fingers[names[0]], **change)
+    return replace(scene, fingers=(fingers["1"], fingers["2"]))
 
 
 def change_curve(curve: Curve, key: str, value: float) -> Curve:
@@ -198,14 +196,10 @@ def find_shortfalls(
     limits: LimitSet, values: Array, places: Sequence[LimitPlace]
 ) -> list[Shortfall]:
     """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
-    violation, shortfalls = limits.fold(-limits.find_slack(values)), []
-    for k, limit in enumerate(limits.limits):
-        of_limit = violation[:, limits.owners == k].max(axis=1)
-        worst = int(of_limit.argmax())
-        amount = float(of_limit[worst])
-        if amount > 1e-4 * limit.scale:  # least violation that counts, over the scale of a limit
-            what = (limit.kind, limit.part, limit.text, amount, limit.unit)
-            shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
+    shortfalls = []
+    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least miss that counts
+        what = limit.kind, limit.part, limit.text, amount, limit.unit
+        shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
     return shortfalls
 
 
@@ -233,11 +227,9 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
     short += 0.05 * data.limits.scales
     nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, Objective.ELASTIC)
-    result = nlp.solver(
-        x0=pack(nlp, profile, units, short / units.of(data.limits)),
-        p=parameters(nlp, data, units, 1.0),
-        **make_bounds(nlp, data, units, Tightening.none(data, None)),
-    )
+    x0 = pack(nlp, profile, units, short / units.of(data.limits))
+    bounds = make_bounds(nlp, data, units, Tightening.none(data, None))
+    result = nlp.solver(x0=x0, p=parameters(nlp, data, units, 1.0), **bounds)
     if not nlp.solver.stats()["success"]:
         return SolverError(stopped)
     elastic, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
@@ -246,11 +238,9 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     for part, part_profile, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
         motions.append(PathMotion(part.curve, part.grid, part_profile))
         suffix = f", phase {phase}" if len(parts) > 1 else ""
+        nodes = zip(motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
         places = [
-            LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}")
-            for t, z in zip(
-                motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True
-            )
+            LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}") for t, z in nodes
         ]
         shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, part_profile), places)
     if not shortfalls:
@@ -396,45 +386,39 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
     for `advise`.
     """
     problem, phases = search.source, search.phases
-    epsilon, last = search.problem.epsilon, stages[-1]
-    stage, node, phase = stages[0], 0, phases[0]
-    statics = Statics(stage.formation, stage.guess.nodes[0, 0])
-    blocked = statics.find_block(epsilon)
-    say = "from rest at its start, {}, no motion begins in any contact mode"
+    epsilon, last, phase = search.problem.epsilon, stages[-1], phases[0]
     alone = len(phases) == 1 and not phase.until.is_release
-    if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
-        stage, node = last, -1
-        statics = Statics(last.formation, last.guess.nodes[-1, 0])
-        blocked = statics.find_block(epsilon, ends=True)
-        say = "at its end, {}, no motion comes to rest in any contact mode"
-    if blocked is None:
-        first = stages[0].formation
+    one_end = alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1
+    for stage, node in [(stages[0], 0), *[(last, -1)] * one_end]:
+        statics = Statics(stage.formation, stage.guess.nodes[node, 0])
+        if blocked := statics.find_block(epsilon, ends=node == -1):
+            break
+    else:
+        first, text = stages[0].formation, ""
         names = " ".join(first.names)
         z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
         if alone and [contact.finger for contact in first.contacts] == [None, None]:
-            raise InfeasibleError(
-                f"phase {phase.number} is infeasible: no finger drives the object on {names}, and "
-                "it stays at rest; add a contact with a finger"
-            )
-        if alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+            text = f"no finger drives the object on {names}, and it stays at rest; add a contact "
+            text += "with a finger"
+        elif alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+            text = f"{names} can only push the object one way, with whatever friction, so that it "
             where = describe_pose(to_si(last, problem).guess.nodes[-1, 0])
-            raise InfeasibleError(
-                f"phase {phase.number} is infeasible: {names} can only push the "
-                "object one way, with whatever friction, so that it does not come to rest at its "
-                f"end, {where}"
-            )
+            text += f"does not come to rest at its end, {where}"
+        if text:
+            raise InfeasibleError(f"phase {phase.number} is infeasible: {text}")
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
-    text = f"phase {phase.number} is infeasible: {say.format(where)}"
+    fails = "no motion comes to rest" if node else "no motion begins"
+    at = "at its end" if node else "from rest at its start"
+    text = f"phase {phase.number} is infeasible: {at}, {where}, {fails} in any contact mode"
     shortfalls = list[Shortfall]()
     if blocked.contact:
         amount = blocked.short * problem.scene.scales.force
         limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
         text += f": {limit} is {amount:.3g} N short at best"
+        what = PRESS, blocked.contact, limit, amount, "N"
         place = LimitPlace(phase.number, math.nan, where)
-        shortfalls.append(
-            Shortfall(PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
-        )
+        shortfalls.append(Shortfall(*what, place, blocked.short))
     else:
         text += " within the torque limits"
 
@@ -494,18 +478,14 @@ def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
 
 def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    phase, epsilon = search.phases[0], search.source.epsilon
+    number = search.phases[0].number
     if not margins or (best := max(margins, key=lambda margin: margin.value)).value > -0.02:
         return
-    limits = make_limits(phase.formation, epsilon).limits
-    limit = next(limit for limit in limits if (limit.kind, limit.part) == best[1:3])
-    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
-    shortfall = Shortfall(*best[1:3], limit.text, missed * limit.scale, limit.unit, place, missed)
-    raise InfeasibleError(
-        f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
-        f"{shortfall}",
-        [shortfall],
-    )
+    limit, missed, place = best.limit, -best.value, LimitPlace(number, math.nan, "the best of them")
+    what = limit.kind, limit.part, limit.text, missed * limit.scale, limit.unit
+    shortfall = Shortfall(*what, place, missed)
+    text = f"phase {number} is infeasible along all straight paths to its ends, at any speed: "
+    raise InfeasibleError(f"{text}{shortfall}", [shortfall])
 
 
 def explain_stages(
@@ -532,19 +512,15 @@ def explain_stages(
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
-    lists = [list_shortfalls(search, stages) for stages in short]
-    sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
-    best = sums.index(min(sums))
-    stages = [to_si(stage, problem) for stage in short[best]]
+    pairs = [(stages, list_shortfalls(search, stages)) for stages in short]
+    nearest, shortfalls = min(pairs, key=lambda pair: sum(one.amount for one in pair[1]))
+    stages = [to_si(stage, problem) for stage in nearest]
 
     def list_values(parameter: Parameter) -> Sequence[float] | None:
         # The limit has to be active; epsilon if no normal force is short of more than that.
         if parameter.key == EPSILON:
-            active = all(
-                shortfall.amount < parameter.value
-                for shortfall in lists[best]
-                if shortfall.kind == PRESS
-            )
+            pressing = (one for one in shortfalls if one.kind == PRESS)
+            active = all(one.amount < parameter.value for one in pressing)
         else:
             parts = [stage.guess for stage in stages]
             tables = (part.v[..., 3:] if parameter.is_speed else part.tau for part in parts)
@@ -552,7 +528,7 @@ def explain_stages(
             active = most > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
             return None
-        solution = search.aiming(Objective.RELAX, parameter).solve(short[best])
+        solution = search.aiming(Objective.RELAX, parameter).solve(nearest)
         # A limit that may be tighter is not in conflict with the others.
         if not solution.success or solution.cost < 0.0:
             return None
@@ -564,7 +540,7 @@ def explain_stages(
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    error = rank(numbers, lists[best], motion)
+    error = rank(numbers, shortfalls, motion)
     return advise(error, parameters, list_values, replan, ADVICE)
 
 
@@ -581,11 +557,9 @@ def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfa
         limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
         tau = blend(at, part.tau.shape[1]) @ part.tau
         y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
-        middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
-        places = [
-            LimitPlace(stage.phase + 1, t, f"t = {t:.4f} s, phase {stage.phase + 1}")
-            for t in np.repeat(middles, len(pick)).tolist()
-        ]
+        middles = passed + np.cumsum(part.h) - part.h / 2
+        number, times = stage.phase + 1, np.repeat(middles, len(pick)).tolist()
+        places = [LimitPlace(number, t, f"t = {t:.4f} s, phase {number}") for t in times]
         values = (y @ limits.rows.T).reshape(-1, len(limits.low))
         for short in find_shortfalls(limits, values, places):
             worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)

@@ -204,13 +204,13 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
         if len(block.phases) == 1:
             continue
         if block.chain is None:
-            from .time_domain.time_plan import list_impacts, plan_parts_of
+            from .time_domain.time_plan import list_impacts, plan_part
 
             impacts = list_impacts(block.phases, block.plans)
-            plan_part = plan_parts_of(planning.problem, block.phases)
+            planner = partial(plan_part, planning.problem, block.phases)
         else:
             impacts = block.chain.list_impacts(block.plans)
-            plan_part = partial(_plan_part, block.chain, planning.problem.epsilon)
+            planner = partial(_plan_part, block.chain, planning.problem.epsilon)
         first = block.phases[0].index
         stops = [
             0,
@@ -224,7 +224,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
                 at = impact.phase - first
                 bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
                 with charge(impact.phase):
-                    impact = impact._replace(saves=_find_saving(planning, block, bounds, plan_part))
+                    impact = impact._replace(saves=_find_saving(planning, block, bounds, planner))
             transitions.append(impact)
     return transitions
 

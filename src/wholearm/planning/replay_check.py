@@ -65,10 +65,8 @@ class ReplayCheck(NamedTuple):
         assert self.failure is not None
         following = dict(enumerate(durations[1:].tolist(), start=1))
         for phase in self.report.phases if isinstance(self.report, Report) else ():
-            departs = (
-                phase.deviation is not None
-                and phase.deviation.measure(scales.length) > allowance.departure
-            )
+            off = phase.deviation.measure(scales.length) if phase.deviation else 0.0
+            departs = off > allowance.departure
             speed = phase.end_speed or 0.0
             carried = speed * following.get(phase.number, 0.0)
             fast = speed > allowance.rest_speed * scales.speed
@@ -104,17 +102,13 @@ def replay_plan(
     assert isinstance(check.report, Report)
     least, number = check.report.least_force
     assert least is not None
-    figures = ReplayFigures(
-        LeastForce(least.least, least.contact, number, least.time),
-        tuple(
-            ReplayedPhase(phase.arrival, phase.end_speed, phase.end_deviation, phase.deviation)
-            for phase in check.report.phases
-        ),
-        check.residual.size,
-        check.report.steps,
-        simulations,
+    force = LeastForce(least.least, least.contact, number, least.time)
+    phases = tuple(
+        ReplayedPhase(phase.arrival, phase.end_speed, phase.end_deviation, phase.deviation)
+        for phase in check.report.phases
     )
-    return planning, figures
+    sizes = check.residual.size, check.report.steps, simulations
+    return planning, ReplayFigures(force, phases, *sizes)
 
 
 def _improve(
@@ -131,12 +125,9 @@ def _improve(
     # Torques where blocks meet depend on both where they may not step.
     reach = 1 if planning.problem.scene.has_slow_motors else 0
     near = range(index - reach, index + reach + 1)
-    again = replace(
-        planning,
-        blocks=tuple(
-            replace(b, coarse=b.coarse or k in near) for k, b in enumerate(planning.blocks)
-        ),
-    )
+    blocks = enumerate(planning.blocks)
+    coarse = tuple(replace(each, coarse=each.coarse or k in near) for k, each in blocks)
+    again = replace(planning, blocks=coarse)
     if planning.allowed:
         least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
         allowed = [

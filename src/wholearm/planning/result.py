@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import reduce
@@ -35,6 +35,9 @@ _KEYS = {
 _OPTIONS = [option.name for option in fields(PlanOptions)]
 _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
 """Options that stand in `meta` by themselves."""
+
+
+_DEVIATIONS = ("end_deviation", "deviation")  # keys of a replayed phase
 
 
 class Status(Enum):
@@ -173,6 +176,8 @@ class Plan(Drawn, Result):
 def write_meta(plan: Plan) -> dict[str, Any]:
     """All of a plan but its motion, in plain values."""
     phases, options = plan.phases, plan.options
+    of_phases = {name: [getattr(phase, name) for phase in phases] for name in _PHASES}
+    spent = {name: [getattr(each.statistics, name) for each in phases] for name in _STATISTICS}
     values: dict[str, Any] = plain(
         {
             "status": plan.status,
@@ -182,14 +187,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "value_unit": plan.unit,
             "error": plan.error,
             "epsilon": plan.problem.epsilon,
-            **{
-                _KEYS.get(name, name): [getattr(phase, name) for phase in phases]
-                for name in _PHASES
-            },
-            **{
-                _KEYS.get(name, name): [getattr(phase.statistics, name) for phase in phases]
-                for name in _STATISTICS
-            },
+            **{_KEYS.get(name, name): each for name, each in (of_phases | spent).items()},
             **{name: getattr(options, name) for name in _OPTIONS},
             "versions": plan.versions,
             "transitions": plan.transitions,
@@ -201,7 +199,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
     )
     # Deviations have the names of their units in files.
     for phase in values["replay"]["phases"] if plan.replay else ():
-        for key in ("end_deviation", "deviation"):
+        for key in _DEVIATIONS:
             phase[key] = phase[key] and dict(
                 zip(("m", "rad", "s"), phase[key].values(), strict=True)
             )
@@ -229,20 +227,16 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
     """The replay, whose deviations have the names of their units in files."""
 
-    def rename(own: Mapping[str, Any]) -> dict[str, Any]:
+    def rename(key: str, entry: Any) -> Any:
+        if key not in _DEVIATIONS or entry is None:
+            return entry
         # Files of earlier versions do not say when.
-        return {"position": own["m"], "angle": own["rad"], "time": own.get("s")}
+        return {"position": entry["m"], "angle": entry["rad"], "time": entry.get("s")}
 
-    phases = [
-        {
-            **phase,
-            **{key: phase[key] and rename(phase[key]) for key in ("end_deviation", "deviation")},
-        }
-        for phase in given["phases"]
-    ]
     # In earlier versions intervals were doubled for a replay to hold.
     entries = {key: value for key, value in given.items() if key != "refinements"}
-    figures: ReplayFigures = restore(ReplayFigures, {**entries, "phases": phases})
+    phases = [{key: rename(key, phase[key]) for key in phase} for phase in given["phases"]]
+    figures: ReplayFigures = restore(ReplayFigures, entries | {"phases": phases})
     return figures
 
 
@@ -260,30 +254,20 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             key = _KEYS.get(name, name)
             raise InputError("", key, f"{len(values)} values given, {count} needed")
 
-    def read_phase(k: int) -> PlannedPhase:
-        entries = {name: values[k] for name, values in stored.items() if name in _PHASES}
-        spent = {name: values[k] for name, values in stored.items() if name in _STATISTICS}
-        phase: PlannedPhase = restore(
-            PlannedPhase, {"number": k + 1, "statistics": spent, **entries}
-        )
-        return phase
+    def pick(names: Sequence[str], k: int) -> dict[str, Any]:
+        return {name: values[k] for name, values in stored.items() if name in names}
 
-    phases = tuple(map(read_phase, range(count)))
-    replay, timings = meta.get("replay"), meta.get("timings", {})
-    return Plan(
-        problem,
-        options,
-        Status(meta["status"]),
-        float(meta["value"]),
-        trajectory,
-        phases,
-        restore(tuple[Transition, ...], meta.get("transitions", ())),
-        None if replay is None else _read_replay(replay),
-        Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
-        dict(meta.get("versions", {})),
-        restore(Certificate | None, meta.get("certificate")),
-        restore(RangeFigures | None, meta.get("ranges")),
-    )
+    entries = [pick(_PHASES, k) | {"statistics": pick(_STATISTICS, k)} for k in range(count)]
+    numbered = [{"number": number, **entry} for number, entry in enumerate(entries, start=1)]
+    phases = restore(tuple[PlannedPhase, ...], numbered)
+    status, replay, spent = Status(meta["status"]), meta.get("replay"), meta.get("timings", {})
+    transitions = restore(tuple[Transition, ...], meta.get("transitions", ()))
+    figures = None if replay is None else _read_replay(replay)
+    timings = Timings(*(float(spent.get(name, 0.0)) for name in Timings._fields))
+    plan = problem, options, status, float(meta["value"]), trajectory, phases, transitions, figures
+    certificate = restore(Certificate | None, meta.get("certificate"))
+    ranges = restore(RangeFigures | None, meta.get("ranges"))
+    return Plan(*plan, timings, dict(meta.get("versions", {})), certificate, ranges)
 
 
 def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None = None) -> Document:

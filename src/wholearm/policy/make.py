@@ -302,9 +302,7 @@ class Within(NamedTuple):
 
     def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[PathMotion]) -> Array:
         """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
-        limits = [
-            np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
-        ]
+        limits = [np.concatenate([side.pick(each) for each in motions], axis=1) for side in sides]
         limits[1][self.same] = UNLIMITED
         return np.concatenate(limits, axis=1)
 

@@ -124,9 +124,8 @@ def follow(
     def divide(t: Array) -> list[RegulatedStretch]:
         owner = np.searchsorted(starts, t, side="right") - 1
         owner = owner.clip(phases[0].index, phases[-1].index)
-        return [
-            part for phase in phases for part in split_modes(phase, plan, t[owner == phase.index])
-        ]
+        times = [(phase, t[owner == phase.index]) for phase in phases]
+        return [part for phase, each in times for part in split_modes(phase, plan, each)]
 
     parts = divide(t)
     speeds = (1 - 0.05 * k for k in range(11))

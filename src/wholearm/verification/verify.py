@@ -391,15 +391,11 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
     rolling = [columns[row] for row in formation.rolling_rows]
     c = [simulation.c_n[rows][:, columns], simulation.c_t[rows][:, rolling]]
     y = np.nan_to_num(np.hstack([*c, simulation.torque.at(t), simulation.z_dot[rows, 3:]]))
-    short = limits.fold(-limits.find_slack(y @ limits.rows.T))
-    texts = []
-    for k, limit in enumerate(limits.limits):
-        amounts = short[:, limits.owners == k].max(axis=1)
-        worst = int(amounts.argmax())
-        if amounts[worst] > MISSED * limit.scale:
-            text = f"{limit.text} is exceeded by {amounts[worst]:.3g} {limit.unit}"
-            texts.append(f"{text} at t = {t[worst]:.5g} s, phase {phase.number}")
-    return texts
+    return [
+        f"{limit.text} is exceeded by {amount:.3g} {limit.unit} at t = {t[worst]:.5g} s, phase "
+        f"{phase.number}"
+        for limit, amount, worst in limits.list_misses(y @ limits.rows.T, MISSED)
+    ]
 
 
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:

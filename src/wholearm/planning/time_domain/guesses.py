@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, groupby, pairwise
-from operator import truediv
+from operator import attrgetter, truediv
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ from ...mechanics.dynamics import (
     inverse,
     metric_weights,
 )
-from ...mechanics.limits import SPEED, make_limits
+from ...mechanics.limits import SPEED, MotionLimit, make_limits
 from ...mechanics.path_limits import find_slack_rows
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
@@ -42,7 +42,6 @@ from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan
 from .mode_search import (
     LEAST_INTERVALS,
-    Mode,
     can_roll,
     divide,
     drop,
@@ -53,7 +52,7 @@ from .mode_search import (
     release_earlier,
 )
 from .solution import TimeSearch, TimeSolution
-from .stage import Scheme, Stage, StagePoints, resample, scale_state, unit_points
+from .stage import Scheme, Stage, StagePoints, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
 GIVEN = "the contact modes that the problem gives"
@@ -143,9 +142,8 @@ class Guesses:
                     raise InputError("", f"phases[{phase.number}].guess", text)
                 t.append(start + mode.t)
                 z.append(closed)
-        path = CubicSpline(
-            np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
-        )
+        own_t, own_z = np.array(t) / scales.time, scale_state(np.array(z), scales)
+        path = CubicSpline(own_t, own_z, bc_type="clamped")
         # Phase 19 of query 62 has no solution in given modes on the usual intervals.
         finer = (1,) if self.search.options.time_intervals else (1, 2)
         return [Guess(GIVEN, self._follow_given(path, factor)) for factor in finer]
@@ -155,21 +153,17 @@ class Guesses:
         scales, scheme = self.search.source.scene.scales, self.search.scheme
         stages, begin = list[Stage](), 0.0
         for stage, phase in zip(join_modes(self.nearest.stages), self.search.phases, strict=True):
-            modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
-            intervals, span = finer * stage.intervals, modes[-1].t / scales.time
+            modes, intervals = phase.guess or (), finer * stage.intervals
+            span = modes[-1].t / scales.time
 
             def follow(share: Array, begin: float = begin, span: float = span) -> list[Array]:
                 return [path(begin + share * span, order) for order in range(3)]
 
             points = _add_forces(stage.formation, stage.directions, scheme, intervals, span, follow)
-            start = 0.0
-            for signs, group in groupby(modes, key=lambda mode: mode.signs):
-                stop = [mode.t for mode in group][-1] / modes[-1].t
-                count = max(LEAST_INTERVALS, round((stop - start) * intervals))
-                part = resample(points, scheme, np.linspace(0.0, 1.0, count + 1), start, stop)
-                parts.append((part, signs))
-                start = stop
-            stages += divide(stage, parts)
+            lasts = [list(group)[-1] for _, group in groupby(modes, key=attrgetter("signs"))]
+            edges = [0.0, *(mode.t / modes[-1].t for mode in lasts)]
+            signs = [mode.signs for mode in lasts]
+            stages += divide(replace(stage, guess=points), scheme, edges, signs)
             begin += span
         return self._leave_room(link(merge(stages)))
 
@@ -189,7 +183,7 @@ class Guesses:
         for stage, plan in zip(join_modes(self.nearest.stages), plans, strict=True):
             motion = plan.motion
             assert isinstance(motion, PathMotion)
-            parts, rolling = list[tuple[StagePoints, Mode]](), list(stage.formation.rolling_rows)
+            rolling = list(stage.formation.rolling_rows)
             for start, stop, directions in motion.spans:
                 span = stop - start
                 count = max(LEAST_INTERVALS, round(span / motion.duration * stage.intervals))
@@ -205,54 +199,30 @@ class Guesses:
                     for x in (*inner, breaks)
                 )
                 z, v, a, _, c_n, c_t = points
-                part = StagePoints(
-                    span,
-                    np.full(count, 1 / count),
-                    np.stack(ends[:2], axis=1),
-                    z,
-                    v,
-                    a,
-                    np.concatenate([c_n, c_t[..., rolling]], axis=2),
-                    between[3],
-                    np.zeros(0),
-                )
-                part = StagePoints(*map(truediv, part, units))
+                h, nodes = np.full(count, span / count), np.stack(ends[:2], axis=1)
+                c = np.concatenate([c_n, c_t[..., rolling]], axis=2)
+                part = StagePoints(h, nodes, z, v, a, c, between[3], np.zeros(0))
                 signs = np.concatenate(directions)
                 signs[rolling] = 0.0
-                parts.append((part, tuple(signs.tolist())))
-            stages += divide(stage, parts)
+                guess = StagePoints(*map(truediv, part, units))
+                stages.append(in_mode(replace(stage, guess=guess), tuple(signs.tolist())))
         return Guess("the plan along curves", self._leave_room(link(stages)))
 
     def without_stops(self, plans: Sequence[PhasePlan[Motion]]) -> Guess:
         """Along plans of the phases, each of them from rest to rest."""
-        stages = [
-            replace(
-                stage,
-                phase=own.phase,
-                goal=own.goal,
-                released=own.released,
-                monitored=tuple(sorted({*stage.monitored, *own.released})),
-            )
-            for own, plan in zip(join_modes(self.nearest.stages), plans, strict=True)
-            for stage in list_stages([plan])
-        ]
+        stages = list[Stage]()
+        for own, plan in zip(join_modes(self.nearest.stages), plans, strict=True):
+            given: Any = {"phase": own.phase, "goal": own.goal, "released": own.released}
+            for stage in list_stages([plan]):
+                monitored = tuple(sorted({*stage.monitored, *own.released}))
+                stages.append(replace(stage, monitored=monitored, **given))
         return self.resume("a motion with stops between the phases", link(stages))
-
-    def with_earlier_releases(self) -> Iterator[Guess]:
-        """To the nearest ends, with a contact released one mode earlier.
-
-        Case: phases 5 and 6 of `heptagon.toml` with friction 0.06.
-        """
-        stages, name = self.nearest.stages, "a motion that releases a contact earlier"
-        for earlier in (release_earlier(stages, k) for k in range(len(stages))):
-            if earlier:
-                yield Guess(name, link(merge(earlier)))
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal) if self._is_planar() else None
         margin = find_margin(outline, self.search.source.epsilon, paced=True) if outline else None
-        if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
+        if not outline or not margin or margin.value <= -0.3:  # not near a motion
             return None
         return self._follow("a motion straight to the end", outline, margin.profile)
 
@@ -261,16 +231,15 @@ class Guesses:
         """Straight paths to the ends of a single phase, those first that keep limits most."""
         goals = self._list_goals() if self._is_planar() else []
         outlines = [guess for goal in goals if (guess := self._connect(goal))]
-        paths = [
-            (find_margin(outline, self.search.source.epsilon), outline) for outline in outlines
-        ]
+        margins = [find_margin(outline, self.search.source.epsilon) for outline in outlines]
 
         def rank(path: tuple[PathMargin, PathGuess]) -> tuple[float, float]:
             """Feasible paths by their length, others by their margin."""
             (margin, *_), outline = path
             return (-SURE, outline.length) if margin > SURE else (-margin, 0.0)
 
-        return sorted((path for path in paths if path[0].value > -np.inf), key=rank)
+        pairs = zip(margins, outlines, strict=True)
+        return sorted(((margin, path) for margin, path in pairs if margin), key=rank)
 
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths, and along the one with the largest margin."""
@@ -314,7 +283,9 @@ class Guesses:
         if straight is not None:
             yield straight
         yield self.nearest
-        yield from self.with_earlier_releases()
+        # Case: phases 5 and 6 of `heptagon.toml` with friction 0.06.
+        name = "a motion that releases a contact earlier"
+        yield from (Guess(name, stages) for stages in release_earlier(self.nearest.stages))
         yield self.nearest.by_homotopy()
         if not given:
             yield from self.to_others()
@@ -404,13 +375,12 @@ class PathSpeed(NamedTuple):
 class PathMargin(NamedTuple):
     """Largest uniform margin of limits along a path at any speed, and the critical limit."""
 
-    value: float  # -inf without a motion
-    kind: str = ""  # of the limit with the largest sum of multipliers
-    part: str = ""
-    profile: PathSpeed | None = None  # a fast one with nearly that margin
+    value: float
+    limit: MotionLimit  # that with the largest sum of multipliers
+    profile: PathSpeed | None  # a fast one with nearly that margin
 
 
-def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> PathMargin:
+def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> PathMargin | None:
     """Largest margin along a path, by a linear programme; if `paced` also a speed profile.
 
     Unknowns are the squared speed b at the nodes, and the margin. Friction is against the path;
@@ -441,10 +411,9 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
 
     answer = maximise(np.eye(size)[-1], None)
     if answer.status != 0:
-        return PathMargin(-np.inf)
+        return None
     shares = np.abs(answer.ineqlin.marginals).reshape(m, -1).sum(axis=0)
     totals = np.bincount(limits.owners[limits.sides[0]], shares)
-    critical = limits.limits[int(totals.argmax())]
     margin, profile = float(answer.x[-1]), None
     # A fast one may lose half of a positive margin, and a little of a negative one.
     speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(0.5 * margin, margin - 0.02)
@@ -454,12 +423,10 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
         slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
         t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
         length = np.append(0.0, np.cumsum(runs))
-        c = (
-            forces.of_c[..., ONE]
-            + (forces.of_c[..., [A, B]] @ (motion @ fast.x)[..., None])[..., 0]
-        )
+        moving = np.einsum("nci,ni->nc", forces.of_c[..., [A, B]], motion @ fast.x)
+        c = forces.of_c[..., ONE] + moving
         profile = PathSpeed(t, length / length[-1], v / length[-1], c / scene.scales.force)
-    return PathMargin(margin, critical.kind, critical.part, profile)
+    return PathMargin(margin, limits.limits[int(totals.argmax())], profile)
 
 
 def split_path(outline: PathGuess) -> list[PathGuess]:
@@ -547,14 +514,10 @@ def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
     widths = np.diff([0.0, *(place for place, _ in changes), 1.0])
     widths = np.maximum(widths, min(BRIEF / 2, 0.5 / len(widths)))
     edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
-    parts = list[tuple[StagePoints, Mode]]()
-    for (begin, stop), (_, new) in zip(pairwise(edges), [*changes, (1.0, {})], strict=True):
-        count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
-        guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
-        parts.append((guess, tuple(signs)))
-        for row, sign in new.items():
-            signs[row] = sign
-    return divide(stage, parts)
+    modes = [tuple(signs)]
+    for _, new in changes:
+        modes.append(tuple(new.get(row, sign) for row, sign in enumerate(modes[-1])))
+    return [*divide(stage, scheme, edges, modes)]
 
 
 def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Change]]:
@@ -668,11 +631,8 @@ def guess_stages(
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < 1e-5  # closed
             contacts = before.formation.contacts, phase.formation.contacts
             renamed = list_renamed(scene, *contacts)
-            released = tuple(
-                row
-                for row in np.flatnonzero(touching).tolist()
-                if phase.formation.limits[row].gained not in renamed
-            )
+            closed, limits = np.flatnonzero(touching).tolist(), phase.formation.limits
+            released = tuple(row for row in closed if limits[row].gained not in renamed)
         stages.append(
             Stage(
                 phase.index,
@@ -758,10 +718,8 @@ def _add_forces(
         c = np.zeros((len(G), formation.n_constraints))
         c[:, : formation.n_contacts] = _LIGHT
         missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
-        c += [
-            np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
-            for rows, short in zip(G[:, :, :3], missing, strict=True)
-        ]
+        pairs = zip(G[:, :, :3], missing, strict=True)
+        c += [np.linalg.lstsq(rows.T, short, rcond=1e-6)[0] for rows, short in pairs]
         c_n = c[:, : formation.n_contacts]
         c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
     # Torques of the motion, within limits, at about as many points as they have control points.
@@ -769,17 +727,8 @@ def _add_forces(
     limit = 0.9 * scene.torque_limit
     tau = np.clip(tau, -limit, limit).reshape(*z.shape[:2], 2)
     tau = tau[:, np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)]
-    return StagePoints(
-        duration,
-        np.full(count, 1 / count),
-        np.stack(follow(breaks)[:2], axis=1),
-        z,
-        v,
-        a,
-        c.reshape(*z.shape[:2], -1),
-        tau,
-        np.zeros(0),
-    )
+    h, nodes = np.full(count, duration / count), np.stack(follow(breaks)[:2], axis=1)
+    return StagePoints(h, nodes, z, v, a, c.reshape(*z.shape[:2], -1), tau, np.zeros(0))
 
 
 def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -26,7 +26,7 @@ from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
 from ...mechanics.sensitivity import find_slopes_at
-from ...problem.definition import Phase, Problem
+from ...problem.definition import PARAMETERS, Phase, Problem
 from ...results.trajectory import Samples
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..refinement import CostlyError, refine
@@ -39,7 +39,6 @@ from .stage import (
     in_own_units,
     make_scheme,
     monitor,
-    scale_options,
     unit_lengths,
     unit_of,
     with_controls,
@@ -109,23 +108,20 @@ class TimeSolution(NamedTuple):
 
 @dataclass
 class TimeSearch:
-    """Data common to all solves for a plan, and their statistics.
+    """Data common to all solves for a plan, and their statistics."""
 
-    All but `source`, `phases` and `to_go` is in the scene's own units.
-    """
-
-    source: Problem  # in SI units
+    source: Problem
     phases: Sequence[Phase]  # those of the NLP
-    problem: Problem
+    problem: Problem  # in the scene's own units
     options: PlanOptions
     scheme: Scheme
-    duration: float | None  # longest duration, for the objective `margin`
+    duration: float | None  # [s]: longest duration, for the objective `margin`
     goal: Objective
-    relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
     to_go: CostToGo | None = None
-    price: Price | None = None
-    ample: float = math.inf  # normal force at which the objective `margin` saturates
+    ample: float = math.inf  # [N]: normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
+    relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
+    price: Price | None = None  # in the scene's own units
     searched: bool = False  # whether the modes of the first guess are those of a mode search
     tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
@@ -139,20 +135,10 @@ class TimeSearch:
         ample: float = math.inf,
         only_begins: bool = False,
     ) -> TimeSearch:
-        """A search with the arguments of `plan_phases`, in SI units."""
-        scales = problem.scene.scales
-        return TimeSearch(
-            problem,
-            phases or problem.phases,
-            in_own_units(problem),
-            scale_options(options, scales),
-            make_scheme(options.scheme, options.degree, options.degree),
-            None if duration is None else duration / scales.time,
-            options.goal,
-            to_go=to_go,
-            ample=ample / scales.force,
-            only_begins=only_begins,
-        )
+        """A search with the arguments of `plan_phases`."""
+        scheme = make_scheme(options.scheme, options.degree, options.degree)
+        given = phases or problem.phases, in_own_units(problem), options, scheme, duration
+        return TimeSearch(problem, *given, options.goal, to_go, ample, only_begins)
 
     @property
     def numbers(self) -> list[int]:
@@ -189,7 +175,7 @@ class TimeSearch:
     @property
     def most_margin(self) -> float:
         """Margin at which the objective saturates."""
-        return self.ample - self.problem.epsilon
+        return self.ample / self.source.scene.scales.force - self.problem.epsilon
 
     def solve(
         self,
@@ -219,17 +205,18 @@ class TimeSearch:
             solution = self.run(nlp, stages, limits, multipliers, margin)
             if raised or not solution.success:
                 return solution
-            tables = [
-                s.formation.evaluate_limits(s.guess.z.reshape(-1, 5)) for s in solution.stages
-            ]
-            stages = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
+            places = [stage.guess.z.reshape(-1, 5) for stage in solution.stages]
+            pairs = zip(solution.stages, places, strict=True)
+            least = [stage.formation.evaluate_limits(z).min(axis=0) for stage, z in pairs]
+            stages = monitor(solution.stages, least, depth)
             if stages is solution.stages:
                 return solution
             nlp, multipliers = None, None
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
-        target = Target(self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation)
+        weight = self.options.time_weight / self.source.scene.scales.torque**2
+        target = Target(self.goal, self.problem.epsilon, weight, self.relaxation)
         most = {Objective.ELASTIC: 90, Objective.RELAX: 50}.get(self.goal, most)
         return build_time_nlp(stages, self.scheme, target, most)
 
@@ -244,7 +231,7 @@ class TimeSearch:
         """Run the solver once."""
         (low, high), (low_g, high_g) = find_bounds(nlp, stages, self.scheme, limits)
         if self.duration is not None and nlp.duration_row >= 0:
-            high_g[nlp.duration_row] = self.duration
+            high_g[nlp.duration_row] = self.duration / self.source.scene.scales.time
         if self.goal is Objective.MARGIN:
             # Solving for more than the saturated margin takes long.
             high[nlp.layouts[-1].margin[-1]] = 1.1 * self.most_margin
@@ -268,18 +255,12 @@ class TimeSearch:
         stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(price.gradient @ price.origin)
-        return TimeSolution(
-            [
-                replace(stage, guess=part)
-                for stage, part in zip(stages, unpack(x, nlp.layouts), strict=True)
-            ],
-            cost,
-            -cost if self.goal is Objective.MARGIN else 0.0,
-            f"Ipopt stopped with {stats['return_status']}",
-            stats["success"],
-            nlp,
-            {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
-        )
+        pairs = zip(stages, unpack(x, nlp.layouts), strict=True)
+        solved = [replace(stage, guess=part) for stage, part in pairs]
+        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+        status = f"Ipopt stopped with {stats['return_status']}"
+        margin = -cost if self.goal is Objective.MARGIN else 0.0
+        return TimeSolution(solved, cost, margin, status, stats["success"], nlp, multipliers)
 
 
 @dataclass(frozen=True)
@@ -365,16 +346,11 @@ class TimeIterate:
         """With finer intervals, raised limits and those of the formation that are violated."""
         if self.violation <= 1 and not self.is_coarse:
             return None
+        stages = bisect_intervals(self.monitored, self.search.scheme, self.halvings)
         triples = zip(self.raised, self.misses, self.halvings, strict=True)
-        return replace(
-            self,
-            stages=bisect_intervals(self.monitored, self.search.scheme, self.halvings),
-            raised=[
-                amounts.add(miss, SETTINGS.over).halve(mine) for amounts, miss, mine in triples
-            ],
-            is_solved=False,
-            refined=self.refined + self.is_coarse,
-        )
+        raised = [limits.add(miss, SETTINGS.over).halve(mine) for limits, miss, mine in triples]
+        refined = self.refined + self.is_coarse
+        return replace(self, stages=stages, raised=raised, is_solved=False, refined=refined)
 
     def restart(self) -> None:
         """Without a solution there is no other iterate."""
@@ -397,17 +373,11 @@ class TimeIterate:
         return [find_misses(stage, check, epsilon, margin) for stage, check in pairs]
 
     @cached_property
-    def over(self) -> list[Array]:
-        """The largest miss of each interval of each stage, over its tolerance."""
-        return [measure_misses(miss) for miss in self.misses]
-
-    @cached_property
     def monitored(self) -> list[Stage]:
         """The stages with limits of their formations that are violated between points."""
         lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in self.checks]
-        return monitor(
-            self.stages, lowest, SETTINGS.graze * self.search.problem.scene.scales.length
-        )
+        depth = SETTINGS.graze * self.search.problem.scene.scales.length
+        return monitor(self.stages, lowest, depth)
 
     @cached_property
     def gains(self) -> list[Array]:
@@ -425,7 +395,7 @@ class TimeIterate:
             limit, shares = search.problem.scene.torque_limit, list[Array]()
             for part in (stage.guess for stage in stages):
                 bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
-                shares.append(part.duration * part.fractions * bends)
+                shares.append(part.h * bends)
             return [share * (self.change / max(_sum(shares), 1e-300)) for share in shares]
         square, gains = float(search.goal is Objective.EFFORT), list[Array]()
         x, weights = np.polynomial.legendre.leggauss(7)
@@ -507,7 +477,7 @@ class TimeIterate:
         """The largest miss, over its tolerance; infinite where the NLP lacks a limit."""
         if self.monitored is not self.stages:
             return math.inf
-        return float(max(ratios.max() for ratios in self.over))
+        return float(max(measure_misses(miss).max() for miss in self.misses))
 
     @property
     def error(self) -> float:
@@ -628,7 +598,8 @@ def find_misses(
 def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Array:
     """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
     formation, count, epsilon = stage.formation, len(check.places), search.problem.epsilon
-    ranges: Mapping[str, float] = search.options.ranges
+    ranges, length = search.options.ranges, search.source.scene.scales.length
+    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
     limits = make_limits(formation, epsilon)
     sides, total = limits.sides[0], np.zeros((count, len(limits.low)))
     names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
@@ -644,7 +615,8 @@ def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Arr
             edges = find_edges(formation, rows, name)
             if edges is not None:
                 change = change + c @ edges.T - epsilon * edges.sum(axis=1)
-            total[:, forces] += ranges[name] * np.abs(change)
+            radius = ranges[name] / (length if name in lengths else 1.0)
+            total[:, forces] += radius * np.abs(change)
     return np.asarray(total[:, sides] / limits.scales[sides])
 
 

@@ -19,9 +19,9 @@ from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import make_limits
-from ...problem.definition import PARAMETERS, Phase, Problem, Until
+from ...problem.definition import Phase, Problem, Until
 from ...scene.model import Polygon, Scales, Scene
-from ..options import CLEARANCE, OPENING, Objective, PlanOptions
+from ..options import CLEARANCE, OPENING, Objective
 
 
 class Scheme(NamedTuple):
@@ -29,8 +29,9 @@ class Scheme(NamedTuple):
 
     name: str
     points: Array  # (d,): increasing
-    integrals: Array  # (d, d): row j integrates the interpolating polynomial from 0 to point j
-    weights: Array  # (d,): the same from 0 to 1
+    # (d, d) or (d + 1, d): each row integrates the interpolating polynomial from 0 to a point, the
+    # last one to 1, whether that is a point or not
+    rungs: Array
     order: int  # of the error at the end of an interval
     controls: int  # number of control points of the torques in an interval
 
@@ -43,11 +44,6 @@ class Scheme(NamedTuple):
     def ends(self) -> bool:
         """Whether the last point is the end of the interval."""
         return bool(self.points[-1] == 1.0)
-
-    @property
-    def rungs(self) -> Array:
-        """Rows of the integrals to every point, and to the end if no point is there."""
-        return self.integrals if self.ends else np.vstack([self.integrals, self.weights])
 
     def interpolate(self, places: Array) -> Array:
         """Values at `places`, shape (n,), from those at the points: a matrix of shape (n, d)."""
@@ -79,22 +75,18 @@ def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     Zeros of P_d - P_d-1, 1 among them, or of P_d (E. Hairer and G. Wanner, Solving Ordinary
     Differential Equations II, section IV.5). `controls` are control points of torques.
     """
-    if name == "radau":
-        points = (np.append(jacobi_nodes(degree - 1, 1, 0), 1.0) + 1) / 2
-    else:
-        points = (jacobi_nodes(degree) + 1) / 2
-    powers = np.arange(1, degree + 1)
-    invert = np.linalg.inv(points[:, None] ** (powers - 1))
-    integrals = (points[:, None] ** powers / powers) @ invert
-    order = 2 * degree - (name == "radau")
-    return Scheme(name, points, integrals, (1 / powers) @ invert, order, controls)
+    radau, powers = name == "radau", np.arange(1, degree + 1)
+    inner = jacobi_nodes(degree - 1, 1, 0) if radau else jacobi_nodes(degree)
+    ends = np.append((inner + 1) / 2, 1.0)
+    points = ends[:degree]
+    rungs = (ends[:, None] ** powers / powers) @ np.linalg.inv(points[:, None] ** (powers - 1))
+    return Scheme(name, points, rungs, 2 * degree - radau, controls)
 
 
 class StagePoints(NamedTuple):
     """Motion and forces of a stage in K intervals with d points each."""
 
-    duration: float  # [s]
-    fractions: Array  # (K,): share of the duration that each interval has
+    h: Array  # (K,) [s]: durations of the intervals
     nodes: Array  # (K + 1, 2, 5): z and z' at the start of each interval and at the end of the last
     z: Array  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
     v: Array
@@ -102,6 +94,16 @@ class StagePoints(NamedTuple):
     forces: Array  # (K, d, n_c + R) [N]: c_n of all contacts, then c_t of the rolling ones
     tau: Array  # (K, m, 2) [N m]: control points of torques, of degree m - 1 in each interval
     impulses: Array  # (n_c + R,) [N s]: of the impact with which the stage ends, if it does
+
+    @property
+    def duration(self) -> float:
+        """How long the stage lasts [s]."""
+        return float(self.h.sum())
+
+    @property
+    def fractions(self) -> Array:
+        """Share of the duration that each interval has, shape (K,)."""
+        return np.asarray(self.h / self.duration)
 
     @property
     def breaks(self) -> Array:
@@ -153,7 +155,7 @@ class Stage:
     @property
     def intervals(self) -> int:
         """Number of intervals K."""
-        return len(self.guess.fractions)
+        return len(self.guess.h)
 
     @property
     def ending(self) -> Formation:
@@ -170,8 +172,7 @@ class Stage:
         """The same stage with a guess that takes so many times as long."""
         part = self.guess
         nodes, v, a = part.nodes / [[1.0], [factor]], part.v / factor, part.a / factor**2
-        longer = part._replace(duration=factor * part.duration, nodes=nodes, v=v, a=a)
-        return replace(self, guess=longer)
+        return replace(self, guess=part._replace(h=factor * part.h, nodes=nodes, v=v, a=a))
 
     def begin_at(self, z: Array, v: Array) -> Stage:
         """The same stage with another state, (5,) each, where its guess begins."""
@@ -187,9 +188,7 @@ class Stage:
         """
         slow = self.formation.scene.has_slow_motors
         late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
-        released, apart = (
-            np.isin(self.monitored, limits) for limits in (self.released, self.apart)
-        )
+        released, apart = (np.isin(self.monitored, k) for k in (self.released, self.apart))
         opened = np.where(self.opens, late, 1.0)
         return np.asarray(self.clearance * np.maximum(released * opened, apart * late))
 
@@ -271,16 +270,6 @@ def scale_state(z: Array, scales: Scales) -> Array:
     return np.asarray(z / unit_lengths(scales))
 
 
-def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
-    """Options in own units."""
-    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
-    ranges = {
-        name: radius / scales.length if name in lengths else radius
-        for name, radius in options.ranges.items()
-    }
-    return replace(options, time_weight=options.time_weight / scales.torque**2, ranges=ranges)
-
-
 def unit_of(goal: Objective, scales: Scales) -> float:
     """Unit of an objective in SI units."""
     efforts = scales.torque**2 * scales.time
@@ -296,7 +285,7 @@ def unit_points(scales: Scales) -> StagePoints:
     """Units of motion and forces in SI units."""
     z, unit, force = unit_lengths(scales), scales.time, scales.force
     nodes, torque, impulse = np.stack([z, z / unit]), scales.torque, force * unit
-    units: Any = (unit, 1.0, nodes, z, z / unit, z / unit**2, force, torque, impulse)
+    units: Any = (unit, nodes, z, z / unit, z / unit**2, force, torque, impulse)
     return StagePoints(*units)
 
 
@@ -311,32 +300,28 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
     return replace(stage, formation=formation, guess=points, gained=None)
 
 
-def resample(
-    part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
-) -> StagePoints:
-    """Part of a stage from `begin` to `stop`, on intervals with `breaks`, (K + 1,), in [0, 1]."""
-    span = stop - begin
-    fractions = np.diff(breaks)
-    inner = breaks[:-1, None] + fractions[:, None] * scheme.points
-    shape = (len(fractions), scheme.degree, -1)
-    points = _interpolate(part, scheme, (begin + span * inner).ravel())
-    nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
+def resample(part: StagePoints, scheme: Scheme, breaks: Array) -> StagePoints:
+    """Part of a stage on other intervals with `breaks`, (K + 1,), shares of its duration."""
+    lengths, (count, controls) = np.diff(breaks), part.tau.shape[:2]
+    shape = (len(lengths), scheme.degree, -1)
+    places = breaks[:-1, None] + lengths[:, None] * scheme.points
+    points = _interpolate(part, scheme, places.ravel())
+    nodes = np.stack(_interpolate(part, scheme, breaks)[:2], axis=1)
     z, v, a, forces = (table.reshape(shape) for table in points)
     # Torques of each new interval are those of the old one at its middle.
-    edges, count, controls = begin + span * breaks, *part.tau.shape[:2]
-    middles = (edges[1:] + edges[:-1]) / 2
+    middles = (breaks[1:] + breaks[:-1]) / 2
     k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
     at = np.linspace(0.0, 1.0, controls)
-    places = edges[:-1, None] + np.diff(edges)[:, None] * at
+    places = breaks[:-1, None] + lengths[:, None] * at
     x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
     tau = fit_controls(at, blend(x, controls) @ part.tau[k], controls)
-    impulses = part.impulses if stop == 1.0 else part.impulses[:0]
-    return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
+    impulses = part.impulses if breaks[-1] == 1.0 else part.impulses[:0]
+    return StagePoints(part.duration * lengths, nodes, z, v, a, forces, tau, impulses)
 
 
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
     """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
-    count, degree = len(part.fractions), scheme.degree
+    count, degree = len(part.h), scheme.degree
     # z'' and forces may step after the last point of an interval.
     k = np.clip(np.searchsorted(part.breaks, places - 1e-12) - 1, 0, count - 1)
     x = (places - part.breaks[k]) / part.fractions[k]
@@ -397,9 +382,8 @@ def _find_excess(stage: Stage) -> float:
     Goal 52 of the corpus lands past a fingertip without it, and takes 6 % longer.
     """
     until, formation = stage.until, stage.formation
-    if until is None or until.contact is None:
-        return 0.0
-    if 5 - formation.n_constraints - len(until.pins) < 2:
+    pins = 0 if until is None else len(until.pins)
+    if until is None or until.contact is None or 5 - formation.n_constraints - pins < 2:
         return 0.0
     texts, gained = {limit.text for limit in formation.limits}, formation.add(until.contact)
     values = gained.evaluate_limits(stage.guess.nodes[-1:, 0])[0].tolist()

@@ -198,10 +198,9 @@ class TimeMotion:
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             formation, (Xi, sigma) = stage.formation, stage.directions
             rolls = formation.rolling_rows
-            contacts = {
-                name: ROLLS if k in rolls else "+" if Xi[k] > 0 else "-"
-                for k, name in enumerate(formation.names)
-            }
+            slides = ("+" if xi > 0 else "-" for xi in Xi)
+            modes = [ROLLS if k in rolls else sign for k, sign in enumerate(slides)]
+            contacts = dict(zip(formation.names, modes, strict=True))
             joints = tuple("+" if sign > 0 else "-" for sign in sigma)
             spans.append(ModeSpan(start, start + stage.duration, contacts, joints))
         return tuple(spans)
@@ -209,12 +208,12 @@ class TimeMotion:
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
-        owner = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.stages) - 1)
-        order, parts = np.argsort(owner, kind="stable"), list[Samples]()
-        for index, stage in enumerate(self.stages):
-            if (owner == index).any():
-                parts.append(stage.evaluate(t[owner == index] - self.starts[index]))
-        inverse = np.argsort(order)
+        owner = np.searchsorted(self.starts[1:-1], t, side="right")
+        parts = [
+            self.stages[k].evaluate(t[owner == k] - self.starts[k])
+            for k in sorted({*owner.tolist()})
+        ]
+        inverse = np.argsort(np.argsort(owner, kind="stable"))
         return Samples(*(np.concatenate(tables)[inverse] for tables in zip(*parts, strict=True)))
 
 

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -60,6 +61,7 @@ SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, a
 class StageLayout:
     """Indices of one stage's unknowns; those of `StagePoints` have the shapes there."""
 
+    h: Indices
     nodes: Indices
     z: Indices
     v: Indices
@@ -67,7 +69,6 @@ class StageLayout:
     forces: Indices
     tau: Indices
     impulses: Indices  # of the impact that leads to the next stage, if one does
-    h: Indices  # (K,): durations of the intervals
     margin: Indices  # (K + 1, 1) or (K + 1, 0): copies of a margin or relaxation at the nodes
     short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     begin: Indices  # begin, finish: c_n, c_t and friction of the joints at rest at both ends, of
@@ -97,64 +98,43 @@ def lay_out(
         # In elastic mode every limit but those of speeds has a shortfall in each interval.
         soft = make_limits(formation, target.epsilon).without(SPEED).limits
         short = len(soft) * (target.objective is Objective.ELASTIC)
-        points = d * (15 + formation.n_constraints)
+        width, end = d * (15 + formation.n_constraints), 10 * (not scheme.ends)
         begins = held and (not k or stages[k - 1].rests)
         begin = take((2 * formation.n_contacts + 2) * begins)
         first, first_margin = take(10), take(with_margin)
-        interval = Columns(
-            h=1, tau=2 * m, points=points, end=10 * (not scheme.ends), short=short, m=with_margin
-        )
+        interval = Columns(h=1, tau=2 * m, points=width, end=end, short=short, m=with_margin)
         table = take(K, interval.count)
         at = {name: table[:, part] for name, part in interval.slices.items()}
         of_points = at["points"].reshape(K, d, -1)
         z, v, a, forces = np.split(of_points, [5, 10, 15], axis=2)
         ends = of_points[:, -1, :10] if scheme.ends else at["end"]
         jumps = stage.ends_in_impact and k + 1 < len(stages)
-        layouts.append(
-            StageLayout(
-                np.vstack([first, ends]).reshape(K + 1, 2, 5),
-                z,
-                v,
-                a,
-                forces,
-                at["tau"].reshape(K, m, 2),
-                impulses=take(stages[k + 1].formation.n_constraints if jumps else 0),
-                h=at["h"][:, 0],
-                margin=np.vstack([first_margin, at["m"]]),
-                short=at["short"],
-                begin=begin,
-                finish=take((2 * stage.ending.n_contacts + 2) * (held and stage.rests)),
-            )
-        )
+        nodes, tau = np.vstack([first, ends]).reshape(K + 1, 2, 5), at["tau"].reshape(K, m, 2)
+        impulses = take(stages[k + 1].formation.n_constraints if jumps else 0)
+        margin = np.vstack([first_margin, at["m"]])
+        finish = take((2 * stage.ending.n_contacts + 2) * (held and stage.rests))
+        points = at["h"][:, 0], nodes, z, v, a, forces, tau, impulses
+        layouts.append(StageLayout(*points, margin, at["short"], begin, finish))
     return layouts
-
-
-_TABLES = StagePoints._fields[2:]
 
 
 def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: float) -> Array:
     """Unknowns as one vector."""
     x = np.zeros(layouts[-1].stop)
     for part, layout in zip(points, layouts, strict=True):
-        for name in _TABLES:
-            x[getattr(layout, name)] = getattr(part, name)
-        x[layout.h], x[layout.short], x[layout.margin] = part.duration * part.fractions, 1.0, margin
-        for held, forces in (
-            (layout.begin, part.forces[0, 0]),
-            (layout.finish, part.forces[-1, -1]),
-        ):
+        for name, table in part._asdict().items():
+            x[getattr(layout, name)] = table
+        x[layout.short], x[layout.margin] = 1.0, margin
+        ends = (layout.begin, part.forces[0, 0]), (layout.finish, part.forces[-1, -1])
+        for held, forces in ends:
             x[held[: len(forces)]] = forces[: len(held)]
     return x
 
 
 def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     """What `pack` put together."""
-    parts = []
-    for layout in layouts:
-        duration = float(x[layout.h].sum())
-        tables = [x[getattr(layout, name)] for name in _TABLES]
-        parts.append(StagePoints(duration, x[layout.h] / duration, *tables))
-    return parts
+    names = StagePoints._fields
+    return [StagePoints(*(x[getattr(layout, name)] for name in names)) for layout in layouts]
 
 
 class Target(NamedTuple):
@@ -501,15 +481,11 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
     rows.add_equal(tau[1:, 0], tau[:-1, -1], 1 / scene.torque_limit)
     limited = np.flatnonzero(np.isfinite(scene.torque_rate_limit))
     rates = rows.linear(K, n, len(limited), 2, high=np.inf)
-    for k, joint in enumerate(limited):
-        limit = scene.torque_limit[joint]
-        rows.add_entries(
-            rates[:, :, k], layout.h[:, None, None], scene.torque_rate_limit[joint] / limit
-        )
-        for side, sign in enumerate((1.0, -1.0)):
-            rate_rows = rates[:, :, k, side]
-            rows.add_entries(rate_rows, tau[:, 1:, joint], -sign * n / limit)
-            rows.add_entries(rate_rows, tau[:, :-1, joint], sign * n / limit)
+    limit, signs = scene.torque_limit[limited, None], np.array([1.0, -1.0])
+    most = scene.torque_rate_limit[limited, None] / limit
+    rows.add_entries(rates, layout.h[:, None, None, None], most)
+    rows.add_entries(rates, tau[:, 1:, limited, None], -signs * n / limit)
+    rows.add_entries(rates, tau[:, :-1, limited, None], signs * n / limit)
     lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
     if lagging:
         parameters = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
@@ -586,13 +562,11 @@ def hold_ends(
         rows.add_entries(rows.linear(2, low=low, high=high), friction, 1.0)
     if (first := stages[0]).phase:
         # A command approaches a torque limit only asymptotically in the pause before.
-        scene = first.formation.scene
-        for joint in np.flatnonzero(scene.actuator_lag):
-            limit = scene.torque_limit[joint]
-            fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
-            most = 1 - min(0.05, float(fastest))
-            bound = rows.linear(1, low=-most, high=most)
-            rows.add_entries(bound, layouts[0].tau[0, 0, joint], 1 / limit)
+        scene, joints = first.formation.scene, np.flatnonzero(first.formation.scene.actuator_lag)
+        limit, fastest = scene.torque_limit[joints], scene.torque_rate_limit[joints]
+        most = 1 - np.minimum(0.05, fastest * scene.actuator_lag[joints] / limit)
+        bounds = rows.linear(len(joints), low=-most, high=most)
+        rows.add_entries(bounds, layouts[0].tau[0, 0, joints], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> Flags:
@@ -615,8 +589,9 @@ def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> Fl
 
 
 class _Piece(NamedTuple):
-    """An interval as a part of a period: stage, period, share of the stage, and unknowns."""
+    """An interval as a part of a period: phase, stage, period, share of the stage, unknowns."""
 
+    phase: int
     stage: int
     period: int
     share: float
@@ -632,15 +607,14 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
     scene, duration = stages[0].formation.scene, stages[0].period
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
     pieces = [
-        (stage.phase, _Piece(k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau))
+        _Piece(stage.phase, k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau)
         for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
         for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
     ]
     first: Indices | None = None  # durations of the parts of the first period that is not a last
-    for _, pairs in groupby(pieces, key=lambda pair: pair[0]):
-        phase = [piece for _, piece in pairs]
+    for phase in (list(group) for _, group in groupby(pieces, key=attrgetter("phase"))):
         last = phase[-1].period
-        for period, group in groupby(phase, key=lambda piece: piece.period):
+        for period, group in groupby(phase, key=attrgetter("period")):
             parts, least = list(group), 0.0 if period == last else duration
             spans = np.array([piece.h for piece in parts])
             if duration or first is not None:

@@ -36,23 +36,23 @@ from ...problem.definition import End, Phase, Problem
 from ...results.report import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
-from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
+from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops
 from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
-    PATIENCE,
     WORTH,
     adapt_ends,
     drop_gone,
     drop_stops,
     improve,
     link,
+    list_as_good,
     list_neighbours,
     roll_at_ends,
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, in_own_units, make_scheme, resample, to_si, unit_of, with_controls
+from .stage import Scheme, Stage, make_scheme, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -105,7 +105,14 @@ def plan_phases(
 
     search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
-    solution = _resume(search, guesses, begun) if begun else None
+    solution: TimeSolution | None = None
+    if begun:
+        coarse, guess = begun[0], guesses.resume(begun[0].attempt, list_stages(begun))
+        if coarse.complete or coarse.sequences > 1:  # in modes that have been searched
+            search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
+            solution = solve_guesses(replace(search, searched=True), [guess])
+        else:
+            solution = solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
     stages, pinned = list_stages(fastest), phases[-1].index + 1 < len(problem.phases)
 
     def replan(parameter: Parameter, value: float) -> object:
@@ -120,7 +127,12 @@ def plan_phases(
             solution = change_torques(search, guess.from_rest(), stages if pinned else [])
         else:
             solution = solve_guesses(search, [guess.from_rest()])
-            if solution and guess.rests and _takes_longer(search, solution, free):
+            # One that costs 0.1 % more is another local optimum: a kite (0, 0), (80, 0), (95, 40),
+            # (40, 85), (-10, 45) mm, 0.3 kg, of `wholearm new` that turns to edge 1 brakes before
+            # its impact, in 0.1600 for 0.1508 s.
+            compares = guess.rests and search.goal is not Objective.MARGIN
+            plans = list_plans(search, solution) if solution and compares else []
+            if solution and sum(p.value for p in plans) > 1.001 * sum(p.value for p in free):
                 other = solve_guesses(search, [guesses.nearest])
                 solution = other if other and other.cost < solution.cost else solution
     if solution is None:
@@ -130,11 +142,9 @@ def plan_phases(
             listed = chain(guesses.every(), _free_ends(search, guesses), others)
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
-        solution = solve_guesses(
-            search,
-            chain(guesses.list_given(), listed),
-            lambda: refuse(search, guesses.nearest.stages, explanation),
-        )
+        listed = chain(guesses.list_given(), listed)
+        why = partial(refuse, search, guesses.nearest.stages, explanation)
+        solution = solve_guesses(search, listed, why)
     if solution is None and _can_last(search, stages):
         raise SolverError(
             f"no plan for {name_phases(search.numbers)}: the solver did not converge for the "
@@ -151,18 +161,6 @@ def plan_phases(
             for plan, other in zip(plans, free, strict=True)
         ]
     return plans
-
-
-def _takes_longer(
-    search: TimeSearch, solution: TimeSolution, free: Sequence[PhasePlan[Motion]]
-) -> bool:
-    """Whether a solution costs 0.1 % more than the plans that it is from: a local optimum.
-
-    Case: a kite (0, 0), (80, 0), (95, 40), (40, 85), (-10, 45) mm, 0.3 kg, of `wholearm new` that
-    turns to edge 1 brakes before its impact, in 0.1600 for 0.1508 s.
-    """
-    cost, known = (sum(p.value for p in plans) for plans in (list_plans(search, solution), free))
-    return search.goal is not Objective.MARGIN and cost > 1.001 * known
 
 
 def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> TimeSolution:
@@ -378,7 +376,8 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         # Phase 2 of the route of query 10 has no solution in which a contact turns back without
         # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
         # search leads.
-        others = chain(_list_as_good(search, coarse), [solution] * (searched is not solution))
+        neighbours = list_as_good(search, coarse, list_neighbours(search, coarse))
+        others = chain(neighbours, [solution] * (searched is not solution))
         solutions = (refine_stages(search, other) for other in others)
         refined = next((solution for solution in solutions if solution.success), refined)
     if not refined.success:
@@ -460,16 +459,11 @@ def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
     for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
         last = coming is None or coming.phase != stage.phase
         part, kept = stage.guess, stage.periods.index(stage.periods[-1])
-        left = float(part.fractions[:kept].sum())
-        if last and kept and part.duration * (1 - left) < _BRIEF * stage.period:
+        if last and kept and part.h[kept:].sum() < _BRIEF * stage.period:
             # The end of the interval before is that of the last.
-            names = ("z", "v", "a", "forces", "tau")
-            guess = part._replace(
-                **{name: getattr(part, name)[:kept] for name in names},
-                duration=part.duration * left,
-                fractions=part.fractions[:kept] / left,
-                nodes=np.vstack([part.nodes[:kept], part.nodes[-1:]]),
-            )
+            names = ("h", "z", "v", "a", "forces", "tau")
+            tables = {name: getattr(part, name)[:kept] for name in names}
+            guess = part._replace(**tables, nodes=np.vstack([part.nodes[:kept], part.nodes[-1:]]))
             dropped[k], changed = replace(stage, guess=guess, periods=stage.periods[:kept]), True
     return dropped if changed else []
 
@@ -513,14 +507,6 @@ def cut_periods(
     return cut
 
 
-def _list_as_good(search: TimeSearch, coarse: TimeSolution) -> Iterator[TimeSolution]:
-    """Solutions in neighbouring modes that cost no more."""
-    for stages in list_neighbours(search, coarse):
-        other = search.solve(stages, most=PATIENCE)
-        if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
-            yield other
-
-
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
     """Add the cost-to-go at the end, expanded to first order, and solve again while that gains.
 
@@ -547,17 +533,6 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
     return best
 
 
-def _resume(
-    search: TimeSearch, guesses: Guesses, begun: Sequence[PhasePlan[Motion]]
-) -> TimeSolution | None:
-    """Plan from coarse plans of one NLP, in their modes where these have been searched."""
-    coarse, guess = begun[0], guesses.resume(begun[0].attempt, list_stages(begun))
-    if not (coarse.complete or coarse.sequences > 1):
-        return solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
-    search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
-    return solve_guesses(replace(search, searched=True), [guess])
-
-
 def _list_slow(
     search: TimeSearch, guesses: Iterator[Guess], fastest: list[Stage], pinned: bool, first: Guess
 ) -> Iterator[Guess]:
@@ -575,14 +550,15 @@ def _list_slow(
             breaks = np.linspace(0.0, 1.0, intervals + 1)
             coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
         guesses = chain(islice(guesses, 1), [Guess("a motion of least time", coarse)], guesses)
-    for guess in guesses:
-        end = fastest[-1].guess.nodes[-1, 0] if pinned and fastest else None
-        yield guess if end is None else guess.end_at(end, search.problem)
+    if not (pinned and fastest):
+        return guesses
+    end = fastest[-1].guess.nodes[-1, 0]
+    return (guess.end_at(end, search.problem) for guess in guesses)
 
 
 def _can_last(search: TimeSearch, stages: Sequence[Stage]) -> bool:
     """Whether stages, if any, keep the longest duration."""
-    lasts = sum(stage.guess.duration for stage in stages)
+    lasts = sum(stage.guess.duration for stage in stages) * search.source.scene.scales.time
     return bool(stages) and search.duration is not None and lasts <= search.duration
 
 
@@ -591,37 +567,21 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
     Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
     """
-    scaled_phases = search.problem.phases
-    if not any(_set_free(phase) is not phase for phase in search.phases):
+    pinned = [phase.until.pins for phase in search.phases if phase.formation.n_constraints < 4]
+    if not any(pinned):
         return
-    problem = replace(search.source, phases=tuple(map(_set_free, search.source.phases)))
-    phases = [problem.phases[phase.index] for phase in search.phases]
-    free_search = replace(
-        search,
-        source=problem,
-        phases=phases,
-        problem=in_own_units(problem),
-        only_begins=True,
-        to_go=None,
-        price=None,
-    )
+    free = tuple(replace(p, until=replace(p.until, pins=())) for p in search.source.phases)
+    problem, phases = replace(search.source, phases=free), [free[p.index] for p in search.phases]
+    given = search.options, phases, search.duration, None, search.ample, True
+    free_search = replace(TimeSearch.of(problem, *given), tried=search.tried)
     coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
     if coarse is None:
         return
-    stages = [
-        replace(stage, goal=stage.goal and scaled_phases[stage.phase].until)
-        for stage in coarse.stages
-    ]
+    own = search.problem.phases
+    stages = [replace(each, goal=each.goal and own[each.phase].until) for each in coarse.stages]
     moved = search.solve(link(stages), coarse, ITERATIONS)
     if moved.success:
         yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
-
-
-def _set_free(phase: Phase) -> Phase:
-    """The phase without pins; unchanged where they have no effect."""
-    if not phase.until.pins or phase.formation.n_constraints >= 4:
-        return phase
-    return replace(phase, until=replace(phase.until, pins=()))
 
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
@@ -656,8 +616,8 @@ def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[Tim
         if search.goal is Objective.MARGIN:
             value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
         elif search.goal is Objective.EFFORT:
-            weight = search.options.time_weight * scales.torque**2
-            value = weight * motion.duration + motion.torque.integrate_squares()
+            squares = motion.torque.integrate_squares()
+            value = search.options.time_weight * motion.duration + squares
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
@@ -684,7 +644,8 @@ def plan_with_impacts(
     if not ends:
         others |= {"ample": ample, "fastest": fastest, "free": free}
         return [*plan_phases(problem, block, z, options, duration, **others)]
-    thorough = plan_parts_of(problem, block, ample, free, thorough=True)
+    direct = partial(plan_part, problem, block, ample=ample, free=free)
+    thorough = partial(direct, thorough=True)
     with_stops = partial(plan_stops, thorough, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
@@ -693,43 +654,35 @@ def plan_with_impacts(
         return with_stops(options, duration)
     # A duration that is too short for stops need not be so without them.
     fast = replace(options, objective=Objective.TIME, duration=None)
-
-    def pass_others(blocked: Sequence[int]) -> Plans:
-        direct = plan_parts_of(problem, block, ample, free)
-        return plan_stops(direct, [0, *blocked, len(block)], z, options, duration)
-
+    blocked, failure = list[int](), None
     try:
         stopped = with_stops(options if duration is None else fast)
-    except (InfeasibleError, SolverError):
+        impacts = [_impact_at_stop(block[k - 1], block[k], stopped[k - 1]) for k in ends]
+        blocked = [k for k, impact in zip(ends, impacts, strict=True) if impact.violations]
+    except (InfeasibleError, SolverError) as error:
         # No motion may come to rest where one passes at speed: phase 3 of new polygon 22.
-        with suppress(InfeasibleError, SolverError):
-            return pass_others([])
-        raise
-    blocked = [
-        k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
-    ]
+        failure = error
     if len(blocked) < len(ends):
         with suppress(InfeasibleError, SolverError):
-            return pass_others(blocked)
+            return plan_stops(direct, [0, *blocked, len(block)], z, options, duration)
+    if failure is not None:
+        raise failure
     return stopped if duration is None else with_stops(options, duration)
 
 
-def plan_parts_of(
+def plan_part(
     problem: Problem,
     block: Sequence[Phase],
-    ample: float = math.inf,
+    start: int,
+    stop: int,
+    *given: Any,
     free: Sequence[PhasePlan[Motion]] = (),
     thorough: bool = False,
-) -> PlanPart:
-    """Planner of parts of a block; `thorough` is as of `plan_phases`."""
-
-    def plan_part(
-        start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
-    ) -> Plans:
-        plan = partial(plan_phases, ample=ample, thorough=thorough)
-        return [*plan(problem, block[start:stop], z, options, duration, free=free[start:stop])]
-
-    return plan_part
+    **others: Any,
+) -> Plans:
+    """Plan phases `start` to `stop` of a block, without the latter; as of `plan_phases`."""
+    phases, others = block[start:stop], others | {"free": free[start:stop], "thorough": thorough}
+    return [*plan_phases(problem, phases, *given, **others)]
 
 
 def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[Transition]:
