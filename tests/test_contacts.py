@@ -79,10 +79,8 @@ def test_pointed_tip_has_no_arc() -> None:
 def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
     formation = plane.make_formation(scene, name)
-    slip, z_symbol = (
-        elemental.build_features(scene).pairs[formation.contacts[0]].slip,
-        elemental.build_features(scene).z,
-    )
+    features = elemental.build_features(scene)
+    slip, z_symbol = features.pairs[formation.contacts[0]].slip, features.z
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
     rng = np.random.default_rng(6)
     for z in configurations(6, 8):

@@ -237,16 +237,8 @@ def test_shell_lines_run(line: str, folder: Path, capsys: pytest.CaptureFixture[
 
 def test_results_are_one_line_and_motions_a_picture() -> None:
     problem, plan = problem_of(HEPTAGON), solved(HEPTAGON)
-    results = [
-        plan,
-        plan.trajectory,
-        wholearm.simulate(problem, plan),
-        verified(HEPTAGON),
-        policy(),
-        chart(),
-        problem,
-    ]
-    for result in results:
+    results = [plan, plan.trajectory, wholearm.simulate(problem, plan), verified(HEPTAGON)]
+    for result in (*results, policy(), chart(), problem):
         text = repr(result)
         assert len(text) <= 100 and "\n" not in text
         assert text.startswith(f"{type(result).__name__}(")

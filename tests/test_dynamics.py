@@ -344,10 +344,8 @@ def test_jamming_is_named() -> None:
 def test_what_touches_must_not_be_driven_into() -> None:
     """A square flush on the palm cannot turn about its right corner into the palm."""
     scene = plane.make_scene(plane.SQUARE)
-    flush, corner = (
-        plane.make_formation(scene, "v0-palm v1-palm"),
-        plane.make_formation(scene, "v1-palm"),
-    )
+    both = ("v0-palm v1-palm", "v1-palm")
+    flush, corner = (plane.make_formation(scene, names) for names in both)
     z = np.array([0.0, 0.03, 0.0, 0.5, 2.6])
     for spin in (-2.0, 2.0):
         v = np.array([0.5, -0.03 * spin, spin, 0.0, 0.0])

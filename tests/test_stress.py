@@ -85,11 +85,8 @@ def test_small_steps_end_where_the_curve_does(
     ways = refusals.follow(phase, curves[index].start)
     (reached,) = (way for way in ways if way.reached)
     assert np.abs(reached.end - curves[index].end).max() < 1e-5
-    assert {way.ending for way in ways if not way.reached} <= {
-        "object and palm",
-        "object and finger 1",
-        "object and finger 2",
-    }
+    endings = {way.ending for way in ways if not way.reached}
+    assert endings <= {f"object and {part}" for part in ("palm", "finger 1", "finger 2")}
 
 
 def test_rolling_keeps_its_place() -> None:

@@ -28,7 +28,7 @@ from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.plan import solve
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
-from wholearm.verification.newton_euler import Balance, balance
+from wholearm.verification.newton_euler import BEYOND, Balance, balance
 from wholearm.verification.verify import STRAY, Allowance, list_normal_forces, measure_stray, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
@@ -122,7 +122,8 @@ def test_at_rest_friction_may_be_anything_in_its_cone() -> None:
     np.testing.assert_allclose(left[2], [0, 0, 0, 0.01, 0], atol=1e-13)
     uneven = np.column_stack([push, 0 * push])
     forces = check(formation, Samples(z, rest, rest, 0 * tau, c_n, uneven)).forces
-    cone = 0.3 * weight / 2
+    # As far beyond as plans may miss limits.
+    cone = 0.3 * weight / 2 + BEYOND * scene.scales.force
     np.testing.assert_allclose(forces[:, 0] * scene.scales.force, np.minimum(push, cone))
 
 
