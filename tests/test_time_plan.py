@@ -45,7 +45,7 @@ from wholearm.planning.time_domain.solution import (
     TimeSolution,
     find_least,
 )
-from wholearm.planning.time_domain.stage import Stage, in_own_units
+from wholearm.planning.time_domain.stage import Stage, in_own_units, make_scheme, resample
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
@@ -163,6 +163,18 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
     speeds = [plan.meta["transitions"][-1]["speed"] for plan in (within, along)]
     assert speeds[0] == pytest.approx(speeds[1], rel=1e-2)
     assert [len(phase.modes) for phase in within.phases] == [1, 1, 1, 1]
+
+
+def test_modes_without_freedom_are_refused_without_the_solver(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """A single interval with constant torques, at whose end two contacts turn back."""
+    search = replace(TimeSearch.of(landing(), PlanOptions()), scheme=make_scheme("radau", 3, 1))
+    stage = list_stages(plan_landing())[-1]
+    guess = resample(stage.guess, search.scheme, np.array([0.0, 1.0]))
+    solution = search.solve([replace(stage, guess=guess, turns=(0, 1))])
+    assert not solution.success and "more equations than unknowns" in solution.status
+    assert capfd.readouterr() == ("", "")
 
 
 def test_contacts_that_reverse_at_one_place_do_not_stop_the_motion() -> None:

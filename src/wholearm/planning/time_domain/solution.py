@@ -235,8 +235,11 @@ class TimeSearch:
         if self.goal is Objective.MARGIN:
             # Solving for more than the saturated margin takes long.
             high[nlp.layouts[-1].margin[-1]] = 1.1 * self.most_margin
-        if (low > high).any():
-            status = "limits that hold between points too leave nothing"
+        status = "limits that hold between points too leave nothing" if (low > high).any() else ""
+        if (low_g == high_g).sum() > len(low):
+            # Ipopt refuses it, and CasADi prints that. Case: scene 5 of stress, seed 3, effort.
+            status = "the modes leave no freedom: there are more equations than unknowns"
+        if status:
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
         near = nlp.max_iter > ITERATIONS
         solver = nlp.solver if multipliers else nlp.make_solver(1e-2, **({} if near else GUESSED))
