@@ -59,17 +59,7 @@ from .path_mesh import (
     keep_apart,
     make_grid,
 )
-from .path_motion import (
-    DEGREE,
-    NODES,
-    Elements,
-    Grid,
-    PathMotion,
-    Profile,
-    find_basis,
-    follow,
-    list_maps,
-)
+from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basis, follow, list_maps
 
 if TYPE_CHECKING:
     from ..robust.robust_rows import Guide, RobustLimits
@@ -339,7 +329,7 @@ class PathSolution(NamedTuple):
 
     profile: Profile
     margin: float  # [N]: over epsilon
-    multipliers: dict[str, Array]
+    multipliers: dict[str, Array]  # empty at a point to start from
     cost: float = np.inf  # in the units of the NLP
     duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
 
@@ -380,16 +370,20 @@ class PathIterate:
 
     @staticmethod
     def on(
-        task: Task, parts: list[PhaseData], units: Units, profile: Profile, margin: float
+        task: Task,
+        parts: list[PhaseData],
+        units: Units,
+        profile: Profile,
+        margin: float,
+        goal: Objective | None = None,
     ) -> PathIterate:
         """The NLP on the elements of phases, near a motion and its margin [N].
 
-        Multipliers are those near the central path.
+        Its objective is that of the task if left out.
         """
         data = join(parts)
-        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), task.options.goal)
-        first = PathSolution(profile, margin, center(nlp, data, units, profile, margin))
-        none = Tightening.none(data, task.duration)
+        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal or task.options.goal)
+        first, none = PathSolution(profile, margin, {}), Tightening.none(data, task.duration)
         return PathIterate(task, parts, data, nlp, units, first, none)
 
     def restart(self) -> PathIterate | None:
@@ -403,25 +397,135 @@ class PathIterate:
 
     def solve(self) -> PathIterate:
         """The solution on this mesh."""
-        nlp, data, units, start, task = self.nlp, self.data, self.units, self.solution, self.task
-        bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
+        nlp, units, bounds = self.nlp, self.units, self.make_bounds()
         if (bounds["lbg"] > bounds["ubg"]).any():
             raise SolverError("limits that hold between the nodes too leave nothing")
-        solver = nlp.starter if np.isinf(start.cost) else nlp.solver
-        result = solver(
-            x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
-            p=parameters(nlp, data, units, task.options.time_weight),
-            **bounds,
-            **start.multipliers,
-        )
+        solver = nlp.solver if self.solution.multipliers else nlp.starter
+        bounds |= self.solution.multipliers or self._center()
+        result = solver(x0=self.pack(), p=self.find_parameters(), **bounds)
         stats = solver.stats()
         if not stats["success"]:
             raise SolverError(f"Ipopt stopped with {stats['return_status']}")
-        profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+        # b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
+        x, table = result["x"].full()[:, 0], np.zeros(nlp.free.shape)
+        table[nlp.free] = x
+        profile = follow(self.data.grid, *(table[:, [1, 2]] * units.profile[1:]).T)
+        margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
         multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
         duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
         solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
         return replace(self, solution=solution)
+
+    def pack(self) -> Array:
+        """Unknowns of the NLP, in its units, of the motion to start from.
+
+        Soft limits may be missed by somewhat more than it misses them.
+        """
+        nlp, data, units, (profile, margin, *_) = self.nlp, self.data, self.units, self.solution
+        table = np.empty(nlp.free.shape)
+        table[:, nlp.node["extra"]] = margin / units.force
+        if nlp.objective is Objective.ELASTIC:
+            short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
+            short += 0.05 * data.limits.scales
+            table[:, nlp.node["extra"]] = short / units.of(data.limits)
+        table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
+        table[:, 0] /= data.grid.sizes
+        return np.asarray(table[nlp.free])
+
+    def find_parameters(self) -> Array:
+        """Parameters of the NLP, in its units."""
+        nlp, data, units = self.nlp, self.data, self.units
+        terms, unit = data.find_terms(), units.of(data.limits)
+        b_unit, a_unit, force = units.profile
+        torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
+        blocks = {
+            "steps": data.grid.steps / units.length,
+            "weight": np.array([self.task.options.time_weight / units.power]),
+            "calm": np.array([force / units.press]),
+            "a": terms[..., A] * a_unit / unit,
+            "b": terms[..., B] * b_unit / unit,
+            "lam": terms[..., LAMBDA] * force / unit,
+            "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
+            "torque": data.nodes.forces.of_tau[..., ONE] / torque,
+            "joints": torque**2 / units.power,
+            "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
+            "lags": scene.actuator_lag[list(shape.commands)] / units.time,
+            "maps": data.grid.maps,
+            "sizes": data.grid.sizes,
+        }
+        return np.asarray(nlp.p.join(**{name: block.ravel("F") for name, block in blocks.items()}))
+
+    def make_bounds(self) -> dict[str, Array]:
+        """Bounds of the NLP, with every limit tightened."""
+        nlp, data, units, tightening = self.nlp, self.data, self.units, self.tightening
+        start, pins = self.task.start, self.task.pins
+        share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
+        n, node = len(data.grid.s), nlp.node
+        low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
+        b_max = data.largest_b(data.nodes)
+        # Next to rest b is 2 s times the least s''.
+        s, length = data.grid.s, data.grid.s[-1]
+        low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
+        high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
+        if data.grid.held:
+            low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
+        # From rest to rest, without reversal.
+        if nlp.shape.slow:
+            low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+        else:
+            low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+        if start is not None:
+            _, a_unit, force = units.profile
+            low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
+            low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
+        for place, pin in zip((0, -1), pins, strict=True):
+            if pin is not None:
+                low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
+        low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+        rows, signs, bounds = data.limits.sides
+        sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
+        sides /= units.of(data.limits)[rows]
+        side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
+        width = nlp.g.sizes["limits"] // n
+        rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
+        rows_low[:, side[signs > 0]] = sides[:, signs > 0]
+        rows_high[:, side[signs < 0]] = sides[:, signs < 0]
+        late = nlp.g.sizes["duration"]
+        equal = np.zeros(nlp.g["limits"].start)
+        longest = np.full(late, (tightening.duration or np.inf) / units.time)
+        rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
+        torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
+        most = most * data.torque_limit / torque
+        joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
+        within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+        motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
+        return {
+            "lbx": low[nlp.free],
+            "ubx": high[nlp.free],
+            "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+            "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
+        }
+
+    def _center(self) -> dict[str, Array]:
+        """Multipliers with which a motion is near the central path: none of the links b' = 2 a.
+
+        Empty where limits are soft.
+        """
+        nlp, data, units, (profile, margin, *_) = self.nlp, self.data, self.units, self.solution
+        if nlp.objective is Objective.ELASTIC:
+            return {}
+        (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
+        slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
+        on_rows = np.zeros((len(slack), nlp.shape.rows))
+        for side, row in enumerate(rows.tolist()):
+            on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
+        on_x = np.zeros(nlp.free.shape)
+        on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
+        # The chain's multiplier at a node is the sum of those of normal forces from there on.
+        chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
+        multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
+        on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
+        return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows for this motion, on other elements, or tightened."""
@@ -838,112 +942,6 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
 
 
-def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) -> Array:
-    """Parameters of the NLP, in its units."""
-    terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
-    torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
-    blocks = {
-        "steps": data.grid.steps / units.length,
-        "weight": np.array([time_weight / units.power]),
-        "calm": np.array([force / units.press]),
-        "a": terms[..., A] * a_unit / unit,
-        "b": terms[..., B] * b_unit / unit,
-        "lam": terms[..., LAMBDA] * force / unit,
-        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
-        "torque": data.nodes.forces.of_tau[..., ONE] / torque,
-        "joints": torque**2 / units.power,
-        "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
-        "lags": scene.actuator_lag[list(shape.commands)] / units.time,
-        "maps": data.grid.maps,
-        "sizes": data.grid.sizes,
-    }
-    return np.asarray(nlp.p.join(**{name: block.ravel("F") for name, block in blocks.items()}))
-
-
-def make_bounds(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    tightening: Tightening,
-    start: SureStart | None = None,
-    pins: tuple[float | None, float | None] = (None, None),
-) -> dict[str, Array]:
-    """Bounds of the NLP, with every limit tightened."""
-    share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
-    n, node = len(data.grid.s), nlp.node
-    low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
-    b_max = data.largest_b(data.nodes)
-    # Next to rest b is 2 s times the least s''.
-    s, length = data.grid.s, data.grid.s[-1]
-    low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-    high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
-    if data.grid.held:
-        low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
-    # From rest to rest, without reversal.
-    if nlp.shape.slow:
-        low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
-    else:
-        low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
-    if start is not None:
-        _, a_unit, force = units.profile
-        low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
-        low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
-    for place, pin in zip((0, -1), pins, strict=True):
-        if pin is not None:
-            low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
-    low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
-    rows, signs, bounds = data.limits.sides
-    sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
-    sides /= units.of(data.limits)[rows]
-    side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
-    width = nlp.g.sizes["limits"] // n
-    rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
-    rows_low[:, side[signs > 0]] = sides[:, signs > 0]
-    rows_high[:, side[signs < 0]] = sides[:, signs < 0]
-    late = nlp.g.sizes["duration"]
-    equal = np.zeros(nlp.g["limits"].start)
-    longest = np.full(late, (tightening.duration or np.inf) / units.time)
-    rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
-    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
-    most = most * data.torque_limit / torque
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
-    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
-    motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
-    return {
-        "lbx": low[nlp.free],
-        "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
-    }
-
-
-def pack(
-    nlp: PathNLP, profile: Profile, units: Units, extra: float | Array, sizes: Array | float = 1.0
-) -> Array:
-    """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
-
-    `extra` is the least margin [N], or shortfalls in the units of the limits.
-    """
-    table = np.empty(nlp.free.shape)
-    unit = units.force if nlp.objective is Objective.MARGIN else 1.0
-    table[:, nlp.node["extra"]] = extra / unit
-    table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
-    table[:, 0] /= sizes
-    return np.asarray(table[nlp.free])
-
-
-def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N], if any.
-
-    b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
-    """
-    table = np.zeros(nlp.free.shape)
-    table[nlp.free] = x
-    a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
-    return follow(grid, a, lam), margin
-
-
 # Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one
 # that is tried; case: joints with strong drag.
 _SLOW, _LEAST = -12, -32
@@ -1019,21 +1017,3 @@ def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple
     power = time_weight + float(squares.sum(axis=1).mean())
     most = max(force, float(np.abs(whole).mean()))
     return profile, Units(length, 0.6 * duration, force, torque, power, most)
-
-
-def center(
-    nlp: PathNLP, data: PhaseData, units: Units, profile: Profile, margin: float
-) -> dict[str, Array]:
-    """Multipliers with which a motion is near the central path: none of the links b' = 2 a."""
-    (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
-    slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
-    on_rows = np.zeros((len(slack), nlp.shape.rows))
-    for side, row in enumerate(rows.tolist()):
-        on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
-    on_x = np.zeros(nlp.free.shape)
-    on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
-    # The chain's multiplier at a node is the sum of those of normal forces from there on.
-    chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
-    multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
-    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
-    return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
