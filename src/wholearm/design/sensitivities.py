@@ -126,8 +126,7 @@ def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
     assert block.chain is not None
     iterates, options = list[path_plan.PathIterate](), planning.options
     for part in block.chain.split():
-        numbers, epsilon = [phase.number for phase in part.phases], planning.problem.epsilon
-        task = path_plan.Task(part.continuous_curves, epsilon, options, numbers, None)
+        task = part.make_task(planning.problem.epsilon, options)
         iterates.append(path_plan.plan_task(task))
     value = sum(iterate.objective for iterate in iterates)
     if abs(value - sum(plan.value for plan in block.plans)) > 1e-9 * value:

@@ -38,7 +38,7 @@ from ..results.trajectory import Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.path_plan import plan_curves
+from .path_domain.path_plan import Pins, Task, plan_curves
 from .phase_plan import (
     PER_SPEED,
     Plans,
@@ -216,7 +216,8 @@ def plan_block(
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
-            plans += part.plan(problem.epsilon, options, planning.allow(part.phases))
+            longest = planning.allow(part.phases)
+            plans += plan_curves(part.make_task(problem.epsilon, options, longest))
     return plans, chain
 
 
@@ -477,13 +478,16 @@ class ImpactSequence:
         pairs = zip(self.curves, ratios.tolist(), strict=True)
         return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
-    def plan(
-        self, epsilon: float, options: PlanOptions, duration: float | None = None, **others: Any
-    ) -> Plans:
-        """Plan phases that possible impacts join, from rest to rest; see `plan_curves`."""
+    def make_task(
+        self,
+        epsilon: float,
+        options: PlanOptions,
+        duration: float | None = None,
+        pins: Pins = (None, None),
+    ) -> Task:
+        """Phases that possible impacts join, from rest to rest."""
         numbers = [phase.number for phase in self.phases]
-        curves = self.continuous_curves
-        return [*plan_curves(curves, epsilon, options, numbers, duration, **others)]
+        return Task(self.continuous_curves, epsilon, options, numbers, duration, pins=pins)
 
     def estimate(self, epsilon: float) -> float:
         """Estimated least time [s], with stops where impacts are not possible."""
@@ -541,7 +545,7 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
         if duration is not None and junction is not None:
             duration -= junction.change.duration
         with charge(number):
-            plan = part.plan(epsilon, options, duration, pins=pins)
+            plan: Plans = [*plan_curves(part.make_task(epsilon, options, duration, pins))]
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)
         plans += plan

@@ -47,7 +47,7 @@ from .dwell import require_hold
 from .nlp import open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, fit_torque, join
-from .path_domain.path_plan import PathIterate, Task, guess_slowly, plan_curves, plan_task
+from .path_domain.path_plan import PathIterate, Pins, Task, guess_slowly, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -312,9 +312,9 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
     """
     scene = task.curves[0].formation.scene
 
-    def plan(scene: Scene, *others: Any) -> Scene:
+    def plan(scene: Scene, pins: Pins = (None, None), explained: bool = True) -> Scene:
         curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]
-        plan_curves(curves, task.epsilon, task.options, task.phases, task.duration, *others)
+        plan_curves(replace(task, curves=curves, guides=(), pins=pins), explained)
         return scene
 
     try:
@@ -325,7 +325,7 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
         return error
     for factor in (2.0, 10.0, 100.0):
         with suppress(WholearmError):
-            quick = plan(scene.quicken(factor), False, task.pins)
+            quick = plan(scene.quicken(factor), task.pins, explained=False)
             return refuse_motors(scene, quick, task.phases, reason)
     return refuse_motors(scene, None, task.phases, reason)
 

@@ -33,7 +33,7 @@ from .lower_bound import bound_least_time
 from .nlp import Ledger, charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
-from .path_domain.path_plan import Task, plan_curves
+from .path_domain.path_plan import plan_curves
 from .phase_plan import PlanPart, Plans, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
@@ -233,7 +233,7 @@ def _plan_part(
     chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *others: Any
 ) -> Plans:
     """Plan phases `start` to `stop` of a chain, from rest at their curve's start: a `PlanPart`."""
-    return chain.part(start, stop).plan(epsilon, *others, explained=False)
+    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *others), explained=False)]
 
 
 def _find_saving(
@@ -316,7 +316,7 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
         motions = (planning.plans[number - 1].motion for number in numbers)
         guides = [Guide(m.grid.s, *m.profile) for m in motions if isinstance(m, PathMotion)]
         report(f"looking for the widest ranges of phase {numbers[0]}")
-        widest |= dict.fromkeys(numbers, _find_widest(planning, part, numbers, guides, most))
+        widest |= dict.fromkeys(numbers, _find_widest(planning, part, guides, most))
     if not widest:
         return figures
     each, least = tuple(widest.get(phase.number) for phase in problem.phases), min(widest.values())
@@ -324,11 +324,7 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
 
 
 def _find_widest(
-    planning: Planning,
-    part: ImpactSequence,
-    numbers: Sequence[int],
-    guides: list[Guide],
-    most: float,
+    planning: Planning, part: ImpactSequence, guides: list[Guide], most: float
 ) -> float:
     """The largest factor on ranges, up to `most`, with which phases have a plan; zero for none.
 
@@ -337,22 +333,22 @@ def _find_widest(
     """
     from .robust.robust_rows import Guide
 
-    curves, problem = part.continuous_curves, planning.problem
+    first = part.make_task(planning.problem.epsilon, planning.options)
 
     def scale(factor: float) -> PlanOptions:
-        wider = planning.options.scale_ranges(problem.ranges, factor)
+        wider = planning.options.scale_ranges(planning.problem.ranges, factor)
         return replace(wider, objective=Objective.TIME, duration=None)
 
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > 0.01 * high):  # relatively
-        task = Task(curves, problem.epsilon, scale(middle), numbers, None, guides=tuple(guides))
+        task = replace(first, options=scale(middle), guides=tuple(guides))
         fastest = task.find_fastest()
         if fastest is None:
             high = middle
         else:
             # The minimum-time profile along each curve.
             low, start, guides = middle, 0.0, []
-            for curve in curves:
+            for curve in first.curves:
                 s = np.linspace(0.0, curve.length, len(fastest.s))
                 b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
                 guides.append(Guide(s, none, b, none))
@@ -360,7 +356,7 @@ def _find_widest(
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(8):  # most plans that are tried
         try:
-            plan_curves(curves, problem.epsilon, scale(low).roughen(), numbers, explained=False)
+            plan_curves(replace(first, options=scale(low).roughen()), explained=False)
             return low
         except (InfeasibleError, SolverError):
             low *= 0.98  # factor from one tried plan to the next

@@ -74,25 +74,10 @@ WORTH = 0.02  # largest relative cost of a start that friction cannot hold (`Sur
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
-def plan_curves(
-    curves: Sequence[Curve],
-    epsilon: float,
-    options: PlanOptions,
-    phases: Sequence[int],
-    duration: float | None = None,
-    explained: bool = True,
-    pins: Pins = (None, None),
-) -> Plans:
+def plan_curves(task: Task, explained: bool = True) -> Plans:
     """Plan phases along curves that are run through one after the other, from rest to rest.
 
-    Parameters
-    ----------
-    curves          with speed ratios that make the speed continuous where two of them meet
-    epsilon : [N]   least normal force
-    phases          the phases' numbers, for messages
-    duration : [s]  longest duration of all, for the objective `margin`
-    explained       whether to find out why there is no plan, which takes longer than planning
-    pins : [N]      prescribed internal force at both ends, if any
+    Without a plan it is `explained` why there is none, which takes longer than planning.
 
     Raises
     ------
@@ -102,7 +87,7 @@ def plan_curves(
                      contact forces are not unique
     SolverError      if the solver does not converge
     """
-    task = Task(curves, epsilon, options, phases, duration, pins=pins)
+    options, phases = task.options, task.phases
     try:
         if options.ranges:
             # Rows are for the motion of a reference: first of a plan without ranges.
@@ -110,7 +95,7 @@ def plan_curves(
             task = replace(task, guides=nominal.guides)
         iterate = _plan_within(task)
     except JammingError as jam:
-        if not explained or len(curves) > 1:
+        if not explained or len(task.curves) > 1:
             raise
         from ..explain import explain_jam
 
@@ -128,13 +113,13 @@ def plan_curves(
                 "number as it is"
             ) from None
         raise error from None
-    rounding = MISS * curves[0].formation.scene.scales.force
-    if options.goal is Objective.MARGIN and iterate.plans[0].value < epsilon - rounding:
-        if duration is not None:
+    rounding = MISS * task.curves[0].formation.scene.scales.force
+    if options.goal is Objective.MARGIN and iterate.plans[0].value < task.epsilon - rounding:
+        if task.duration is not None:
             fastest = replace(options, objective=Objective.TIME, duration=None)
             least = plan_task(replace(task, options=fastest, duration=None)).plans
             where = f"{name_phases(phases, 'infeasible')}: "
-            share_duration([plan.value for plan in least], duration, where)
+            share_duration([plan.value for plan in least], task.duration, where)
         raise SolverError(f"{name_phases(phases)}: the margin found is below epsilon")
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
@@ -249,15 +234,15 @@ def find_sure_start(
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of `plan_curves`; with ranges also a reference for each curve."""
+    """Phases along curves that are planned as one."""
 
-    curves: Sequence[Curve]
-    epsilon: float
+    curves: Sequence[Curve]  # with speed ratios that make the speed continuous where two meet
+    epsilon: float  # [N]: least normal force
     options: PlanOptions
-    phases: Sequence[int]
-    duration: float | None
+    phases: Sequence[int]  # the phases' numbers, for messages
+    duration: float | None = None  # [s]: longest one of all, for the objective `margin`
     start: SureStart | None = None
-    guides: tuple[Guide, ...] = ()
+    guides: tuple[Guide, ...] = ()  # with ranges a reference for each curve
     pins: Pins = (None, None)
 
     @cached_property
