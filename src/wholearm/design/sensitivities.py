@@ -150,7 +150,7 @@ def _evaluate_path(
     iterate: path_plan.PathIterate, curves: Sequence[Curve], epsilon: float
 ) -> Terms:
     """Terms of a solution along other curves, on elements between the same reversals."""
-    task, nlp, units, made = iterate.task, iterate.nlp, iterate.units, iterate.solution
+    task, nlp, units = iterate.task, iterate.nlp, iterate.units
     parts = list[path_data.PhaseData]()
     last = len(curves) - 1
     for k, (part, curve, phase) in enumerate(zip(iterate.parts, curves, task.phases, strict=True)):
@@ -165,8 +165,8 @@ def _evaluate_path(
     other = replace(iterate, data=data)
     x, p, bounds = iterate.pack(), other.find_parameters(), other.make_bounds()
     f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
-    of_x = _charge(made.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
-    of_g = _charge(made.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])
+    of_x = _charge(iterate.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
+    of_g = _charge(iterate.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])
     unit = units.time * (units.power if task.options.goal is Objective.EFFORT else 1.0)
     limits = of_g[nlp.g["limits"]].reshape(len(data.grid.s), -1).sum(axis=0).tolist()
     speeds = " and ".join(limit.parameter.name for limit in data.speeds.limits)

@@ -46,8 +46,8 @@ from ..scene.model import Scales, Scene
 from .dwell import require_hold
 from .nlp import open_ledger
 from .options import Objective, PlanOptions
-from .path_domain.path_data import PhaseData, fit_torque, join
-from .path_domain.path_plan import PathIterate, Pins, Task, guess_slowly, plan_curves, plan_task
+from .path_domain.path_data import fit_torque
+from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -205,16 +205,13 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     Torque rate limits, or else limits of which the least violation is found with soft ones.
     `stopped` says in words how the solver ended.
     """
-    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
     if task.is_held:
-        return _explain_rate_limits(task, parts, stopped)
-    data, torque = join(parts), task.curves[0].formation.scene.scales.torque
-    profile, units = guess_slowly(data)
-    units = units._replace(torque=np.full(2, 15.0 * torque))  # as bad as one of force
+        return _explain_rate_limits(task, stopped)
     try:
-        elastic = PathIterate.on(task, parts, units, profile, 0.0, Objective.ELASTIC).solve()
+        elastic = PathIterate.elastic(task).solve()
     except SolverError:
         return SolverError(stopped)
+    data, parts = elastic.data, elastic.parts
     torques, shortfalls, missing = list[TorqueProfile](), list[Shortfall](), None
     for part, motion, phase in zip(parts, elastic.motions, task.phases, strict=True):
         suffix = f", phase {phase}" if len(parts) > 1 else ""
@@ -304,13 +301,14 @@ def explain_jam(task: Task, jam: JammingError) -> JammingError:
     return advise(jam, lower, list_frictions_to_try, partial(_replan_task, task))
 
 
-def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) -> WholearmError:
+def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
     """The error for phases without a plan under rate limits and lags.
 
     It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
     are tried.
     """
     scene = task.curves[0].formation.scene
+    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
 
     def plan(scene: Scene, pins: Pins = (None, None), explained: bool = True) -> Scene:
         curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]

@@ -31,7 +31,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,7 +49,7 @@ from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
-from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
+from .path_data import PhaseData, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
     equidistribute,
@@ -309,16 +309,6 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
         raise AmbiguityError(f"phase {phase}: {text}")
 
 
-class PathSolution(NamedTuple):
-    """A solution of the NLP, or the point to start from."""
-
-    profile: Profile
-    margin: float  # [N]: over epsilon
-    multipliers: dict[str, Array]  # empty at a point to start from
-    cost: float = np.inf  # in the units of the NLP
-    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
-
-
 @dataclass(frozen=True)
 class PathIterate:
     """A mesh with its NLP, and the solution on it or the point to start from."""
@@ -328,8 +318,12 @@ class PathIterate:
     data: PhaseData  # all phases as one
     nlp: PathNLP
     units: Units
-    solution: PathSolution
+    profile: Profile
+    margin: float  # [N]: over epsilon
     tightening: Tightening  # of the limits for that
+    multipliers: dict[str, Array] = field(default_factory=dict)  # empty at a point to start from
+    cost: float = np.inf  # in the units of the NLP
+    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
     meshes: int = 0  # before this one
     before: PathIterate | None = None  # the solution on the mesh before
 
@@ -368,8 +362,19 @@ class PathIterate:
         """
         data = join(parts)
         nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal or task.options.goal)
-        first, none = PathSolution(profile, margin, {}), Tightening.none(data, task.duration)
-        return PathIterate(task, parts, data, nlp, units, first, none)
+        none = np.zeros((len(data.grid.s), len(data.spans)))
+        tightening = Tightening(none, none, np.ones((len(none), 5)), task.duration)
+        return PathIterate(task, parts, data, nlp, units, profile, margin, tightening)
+
+    @staticmethod
+    def elastic(task: Task) -> PathIterate:
+        """The problem with soft limits, from a slow motion whatever they are."""
+        data = join(parts := task.lay_out([np.zeros(0)] * len(task.curves), task.elements))
+        profile, units = _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+        # A shortfall of torque is as bad as one of force.
+        torque = np.full(2, 15.0 * data.curve.formation.scene.scales.torque)
+        units = units._replace(torque=torque)
+        return PathIterate.on(task, parts, units, profile, 0.0, Objective.ELASTIC)
 
     def restart(self) -> PathIterate | None:
         """The solution on the mesh before with tightened limits, or more elements, once."""
@@ -385,8 +390,8 @@ class PathIterate:
         nlp, units, bounds = self.nlp, self.units, self.make_bounds()
         if (bounds["lbg"] > bounds["ubg"]).any():
             raise SolverError("limits that hold between the nodes too leave nothing")
-        solver = nlp.solver if self.solution.multipliers else nlp.starter
-        bounds |= self.solution.multipliers or self._center()
+        solver = nlp.solver if self.multipliers else nlp.starter
+        bounds |= self.multipliers or self._center()
         result = solver(x0=self.pack(), p=self.find_parameters(), **bounds)
         stats = solver.stats()
         if not stats["success"]:
@@ -396,19 +401,23 @@ class PathIterate:
         table[nlp.free] = x
         profile = follow(self.data.grid, *(table[:, [1, 2]] * units.profile[1:]).T)
         margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
-        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
-        solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
-        return replace(self, solution=solution)
+        return replace(
+            self,
+            profile=profile,
+            margin=margin,
+            multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
+            cost=float(result["f"]),
+            duration=float(result["g"][-1]) * units.time if self.tightening.duration else 0.0,
+        )
 
     def pack(self) -> Array:
         """Unknowns of the NLP, in its units, of the motion to start from.
 
         Soft limits may be missed by somewhat more than it misses them.
         """
-        nlp, data, units, (profile, margin, *_) = self.nlp, self.data, self.units, self.solution
+        nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
         table = np.empty(nlp.free.shape)
-        table[:, nlp.node["extra"]] = margin / units.force
+        table[:, nlp.node["extra"]] = self.margin / units.force
         if nlp.objective is Objective.ELASTIC:
             short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
             short += 0.05 * data.limits.scales
@@ -496,11 +505,11 @@ class PathIterate:
 
         Empty where limits are soft.
         """
-        nlp, data, units, (profile, margin, *_) = self.nlp, self.data, self.units, self.solution
+        nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
         if nlp.objective is Objective.ELASTIC:
             return {}
         (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
-        slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
+        slack = data.slack(data.nodes, profile, self.margin) / units.of(data.limits)[rows]
         on_rows = np.zeros((len(slack), nlp.shape.rows))
         for side, row in enumerate(rows.tolist()):
             on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
@@ -514,10 +523,10 @@ class PathIterate:
 
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows for this motion, on other elements, or tightened."""
-        task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
+        task, accuracy = self.task, self.task.options.accuracy
         # A first plan that misses much by signs of no row is a reference only; case: two releases
         # of a pentagon, whose plan takes 20 % longer.
-        slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
+        slack = self.data.slack(self.data.nodes, self.profile, self.margin)
         references = 6  # most
         if task.guides and self.meshes < references and (slack / self.data.spans).min() < -0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
@@ -545,26 +554,26 @@ class PathIterate:
         """Start on at least so many other elements, with these breaks, from this motion."""
         every, held = zip(self.task.curves, breaks, strict=True), self.task.is_held
         ends = [keep_apart(curve, places, held) for curve, places in every]
-        parts, old = self.task.lay_out(ends, elements), self.solution
+        parts = self.task.lay_out(ends, elements)
         grid = join(parts).grid
-        profile = Elements(self.data.grid, old.profile).move(grid)
+        profile = Elements(self.data.grid, self.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, parts, self.units, profile, old.margin)
+        made = PathIterate.on(self.task, parts, self.units, profile, self.margin)
         return replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
         data, tight = self.data, self.tightening
         short, over, _ = self.misses
-        solution, duration = self.solution, self.task.duration
+        duration = self.task.duration
         if duration is not None:
             # The quadrature of the NLP is not that of the motion.
-            off = solution.duration / sum(motion.duration for motion in self.motions)
+            off = self.duration / sum(motion.duration for motion in self.motions)
             duration *= float(np.clip(off, 0.8, 1.2))
         # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
         # Case: the largest margin of phase 3 of the heptagon on four contacts.
-        slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
+        slack, k = data.slack(data.nodes, self.profile, self.margin), data.grid.nonempty
         least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
         reach = np.where(short > 0, least, 0.0)
         added, less = (1.05 * data.spread_to_nodes(violation) for violation in (short, over))
@@ -575,8 +584,10 @@ class PathIterate:
     @cached_property
     def motions(self) -> list[PathMotion]:
         """The motion of each phase."""
-        pairs = zip(self.parts, cut(self.parts, self.solution.profile), strict=True)
-        return [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
+        ends = np.cumsum([len(part.grid.s) for part in self.parts])[:-1]
+        columns = zip(*(np.split(values, ends) for values in self.profile), strict=True)
+        pairs = zip(self.parts, columns, strict=True)
+        return [PathMotion(part.curve, part.grid, Profile(*each)) for part, each in pairs]
 
     @property
     def guides(self) -> tuple[Guide, ...]:
@@ -591,9 +602,9 @@ class PathIterate:
         duration, late = self.task.duration, 0.0
         if duration:
             late = sum(motion.duration for motion in self.motions) / duration - 1
-        data, profile = self.data, self.solution.profile
+        data, profile = self.data, self.profile
         over = np.zeros((len(data.grid.nonempty), 5))
-        short, over[:, 0] = data.misses(profile, self.solution.margin)
+        short, over[:, 0] = data.misses(profile, self.margin)
         if data.grid.held:
             torques, rates = find_torques(data, profile, self.motions)
             rate = np.abs(rates).max(axis=2) / data.rate_limit
@@ -631,15 +642,15 @@ class PathIterate:
         The sum of multipliers times the tightening of limits, (n, n_sides), and what is taken from
         `Tightening.shares`, (n, 5).
         """
-        nlp, data, units, solution = self.nlp, self.data, self.units, self.solution
+        nlp, data, units = self.nlp, self.data, self.units
         rows, signs, _ = data.limits.sides
-        on_g, count = solution.multipliers["lam_g0"], len(data.grid.s)
+        on_g, count = self.multipliers["lam_g0"], len(data.grid.s)
         on_limits = on_g[nlp.g["limits"]].reshape(count, -1)
         on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
         on_b = np.zeros(nlp.free.shape)
-        on_b[nlp.free] = solution.multipliers["lam_x0"]
+        on_b[nlp.free] = self.multipliers["lam_x0"]
         on_shares = np.zeros((count, 5))
-        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
+        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * self.profile.b / data.grid.sizes
         on_shares[:, 0] /= units.profile[0]
         for first, name, joints in (
             (1, "rates", nlp.shape.rates),
@@ -648,9 +659,9 @@ class PathIterate:
             on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
             on_shares[:, [first + joint for joint in joints]] = on_rows
         costs = (on_sides * limits).sum(axis=1) + (on_shares * shares).sum(axis=1)
-        scale = abs(solution.cost)
+        scale = abs(self.cost)
         if self.task.options.goal is Objective.MARGIN:
-            scale = abs(self.task.epsilon + solution.margin) / units.force
+            scale = abs(self.task.epsilon + self.margin) / units.force
         return np.asarray(costs / max(scale, 1e-9))
 
     @cached_property
@@ -662,7 +673,7 @@ class PathIterate:
             value = {
                 Objective.TIME: motion.duration,
                 Objective.EFFORT: squares + options.time_weight * motion.duration,
-                Objective.MARGIN: self.task.epsilon + self.solution.margin,
+                Objective.MARGIN: self.task.epsilon + self.margin,
             }[options.goal]
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
@@ -785,13 +796,6 @@ class Tightening(NamedTuple):
     # (N + 1, 5): factors on the largest b, both torque rate limits and both largest commands
     shares: Array
     duration: float | None  # [s]: longest duration, if there is one
-
-    @staticmethod
-    def none(data: PhaseData, duration: float | None) -> Tightening:
-        """Limits as they are."""
-        count = len(data.grid.s)
-        limits = np.zeros((count, len(data.spans)))
-        return Tightening(limits, limits, np.ones((count, 5)), duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -951,11 +955,6 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     shares = 2 ** np.linspace(_LEAST, 8.0, 256, endpoint=False)
     kept = bisect_left(shares, True, key=is_blocked)
     return _guess_at(data, 0.7 * fall * (shares[kept - 1] if kept else 1.0), time_weight)
-
-
-def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
-    """A slow guess, whatever the limits."""
-    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
 
 
 def _fall(data: PhaseData) -> float:
