@@ -975,8 +975,9 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 def guess_below(data: PhaseData, fastest: Fastest) -> Profile:
     """A guess somewhat slower than the minimum-time profile."""
-    a, b = (_BELOW * np.interp(data.grid.s, *pair) for pair in (fastest.slopes, fastest[:2]))
-    return _complete(data, a, b)[0]
+    s, b, _ = fastest
+    a = np.interp(data.grid.s, (s[1:] + s[:-1]) / 2, np.diff(b) / (2 * np.diff(s)))
+    return _complete(data, _BELOW * a, _BELOW * np.interp(data.grid.s, s, b))[0]
 
 
 def _complete(data: PhaseData, a: Array, b: Array) -> tuple[Profile, Array]:
