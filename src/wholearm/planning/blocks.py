@@ -138,11 +138,24 @@ def plan_blocks(
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Plan block after block, but for those that are planned and not coarse."""
+    """Plan block after block, but for those that are planned and not coarse.
+
+    InfeasibleError if a phase cannot keep epsilon in its share of a longest duration.
+    """
     made, count = replace(planning, blocks=()), len(split_blocks(planning.problem))
     for _, block in zip_longest(range(count), planning.blocks):
         made = plan_next(made, block, report)
-    return _require_margin(made)
+    epsilon = planning.problem.epsilon
+    rounding = 5e-7 * planning.problem.scene.scales.force
+    late = planning.options.goal is Objective.MARGIN
+    for phase, plan in zip(planning.problem.phases, made.plans, strict=True):
+        if late and plan.value < epsilon - rounding:
+            raise InfeasibleError(
+                f"phase {phase.number}: in its share of the duration, "
+                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
+                f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
+            )
+    return made
 
 
 def plan_next(
@@ -323,22 +336,6 @@ def plan_free(
         from .explain import explain_motors
 
         raise explain_motors(planning.problem.scene, block, [], error) from None
-
-
-def _require_margin(planning: Planning) -> Planning:
-    """The planning, or an error for a phase that cannot keep epsilon in its duration."""
-    if planning.options.goal is not Objective.MARGIN:
-        return planning
-    epsilon = planning.problem.epsilon
-    rounding = 5e-7 * planning.problem.scene.scales.force
-    for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
-        if plan.value < epsilon - rounding:
-            raise InfeasibleError(
-                f"phase {phase.number}: in its share of the duration, "
-                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
-                f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
-            )
-    return planning
 
 
 def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from ..results.trajectory import Trajectory
 from ..verification.verify import EXACT_REST, find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
-from .nlp import Ledger, charge, open_ledger
+from .nlp import charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import plan_curves
@@ -144,7 +144,24 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             report("bounding the least time from below")
             certificate = certify(planning)
         gaps = certificate.gaps if certificate else {}
-        phases = _list_phases(planning, ledger, unique, gaps)
+        phases = tuple(
+            PlannedPhase(
+                phase.number,
+                ledger[phase.number],
+                plan.value,
+                plan.motion.duration,
+                tuple(contact.name for contact in phase.formation.rolling),
+                getattr(plan.motion, "modes", ()),
+                plan.sequences,
+                plan.complete,
+                plan.attempt,
+                gaps.get(phase.number, plan.error),
+                *unique[phase.index],
+                plan.settling,
+                None if math.isnan(plan.unheld) else plan.unheld,
+            )
+            for phase, plan in zip(problem.phases, planning.settled, strict=True)
+        )
         plan = Plan(
             problem,
             options,
@@ -172,29 +189,6 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             ranges,
         )
         return replace(plan, trajectory=replace(plan.trajectory, meta=write_meta(plan)))
-
-
-def _list_phases(
-    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness], gaps: Mapping[int, float]
-) -> tuple[PlannedPhase, ...]:
-    return tuple(
-        PlannedPhase(
-            phase.number,
-            ledger[phase.number],
-            plan.value,
-            plan.motion.duration,
-            tuple(contact.name for contact in phase.formation.rolling),
-            getattr(plan.motion, "modes", ()),
-            plan.sequences,
-            plan.complete,
-            plan.attempt,
-            gaps.get(phase.number, plan.error),
-            *unique[phase.index],
-            plan.settling,
-            None if math.isnan(plan.unheld) else plan.unheld,
-        )
-        for phase, plan in zip(planning.problem.phases, planning.settled, strict=True)
-    )
 
 
 def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
