@@ -10,25 +10,24 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import astuple, dataclass
-from functools import wraps
 from operator import add
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression, Numbers
+from ..common.sharing import stored
 from ..common.signals import beat, check
 from ..contacts.formation import Formation
 
 Indices = Numbers
 Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
-_K = TypeVar("_K")
 STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
 _OPTIONS = {
     "print_level": 0,
@@ -119,20 +118,12 @@ def build_kernel(x: Symbols, p: Symbols | None = None, **y: Expression) -> Kerne
     )
 
 
-def share(build: Callable[..., _K]) -> Callable[..., _K]:
-    """Keep the last 64 kernels, each for all formations with the same equations."""
-    kept = dict[tuple[Any, ...], _K]()
+def _identify(*args: Any) -> tuple[Any, ...]:
+    return tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
 
-    @wraps(build)
-    def find(*args: Any) -> _K:
-        key = tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
-        # The latest are last.
-        kept[key] = kept.pop(key) if key in kept else build(*args)
-        if len(kept) > 64:
-            del kept[next(iter(kept))]
-        return kept[key]
 
-    return find
+share = stored(_identify, most=64)
+"""Has a function keep its last kernels, each for all formations with the same equations."""
 
 
 class _Block(NamedTuple):
