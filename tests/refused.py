@@ -17,7 +17,7 @@ from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import explain
 from wholearm.planning.explain import FRICTION, change_limit
-from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.path_domain.path_plan import Task, plan_curves
 from wholearm.planning.time_domain.time_plan import plan_phases
 
 INTERVALS = 15
@@ -37,7 +37,7 @@ def edited(limits: dict[str, float], friction: float = 0.1, viscous: float = 0.0
 
 def plan(problem: Problem, phase: int, explained: bool = True) -> None:
     curve = trace_phases(problem)[phase - 1]
-    plan_curves((curve,), problem.epsilon, OPTIONS, (phase,), explained=explained)
+    plan_curves(Task((curve,), problem.epsilon, OPTIONS, (phase,)), explained)
 
 
 @contextmanager

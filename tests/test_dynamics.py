@@ -28,7 +28,7 @@ from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, sol
 from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.blocks import ImpactSequence
-from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.path_domain.path_plan import Task, plan_curves
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
@@ -512,7 +512,7 @@ def test_a_rod_on_the_palm_is_that_of_painleve() -> None:
 def test_an_ambiguous_scene_is_refused_by_name() -> None:
     rough = problem_of(BOX).with_(friction_palm=0.5)
     with pytest.raises(AmbiguityError, match=r"phase 1: ambiguous: v0-palm with v0-finger2, uniq"):
-        plan_curves(trace_phases(rough)[:1], rough.epsilon, PlanOptions(), (1,), explained=False)
+        plan_curves(Task(trace_phases(rough)[:1], rough.epsilon, PlanOptions(), (1,)), False)
     with pytest.raises(InputError, match=r"uniqueness_margin: 1\.0 given; allowed"):
         plan(rough, uniqueness_margin=1.0)
 

@@ -36,7 +36,7 @@ from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_alo
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_plan import LimitShape, PathNLP, plan_curves
+from wholearm.planning.path_domain.path_plan import LimitShape, PathNLP, Task, plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.results.trajectory import Samples
@@ -164,7 +164,7 @@ def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> 
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     slow = with_speed_limit(curves[2], (0.3, 0.3))
     with pytest.raises(SolverError):
-        plan_curves((slow,), 0.8, PlanOptions(intervals=20), (3,), explained=False)
+        plan_curves(Task((slow,), 0.8, PlanOptions(intervals=20), (3,)), explained=False)
     check_bound((curves[2],), 0.8, 160, 2e-4)
 
 
@@ -174,7 +174,7 @@ def check_bound(curves: Sequence[Curve], epsilon: float, intervals: int, excess:
     assert found is not None and found.error < 3e-8 * found.value
     options = PlanOptions(intervals=intervals, uniqueness_margin=ANY)
     numbers = range(1, len(curves) + 1)
-    plans = plan_curves(curves, epsilon, options, tuple(numbers), explained=False)
+    plans = plan_curves(Task(curves, epsilon, options, tuple(numbers)), explained=False)
     assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < excess
 
 
@@ -196,7 +196,7 @@ def test_two_halves_are_one_whole(objective: str) -> None:
     options = PlanOptions(objective=objective, intervals=40)
     duration = 6.0 if objective == "margin" else None
     with half.in_place():
-        parts = plan_curves((half.curve, half.curve), half.epsilon, options, (1, 2), duration)
+        parts = plan_curves(Task((half.curve,) * 2, half.epsilon, options, (1, 2), duration))
         joined = bound_least_time((half.curve, half.curve), half.epsilon)
     assert joined is not None
     assert joined.value == pytest.approx(bound(whole).value, rel=1e-7)
@@ -414,7 +414,7 @@ def test_an_epsilon_that_cones_allow_is_advised() -> None:
     value = float(advised.split()[0])
     assert plan_path(tip_on(mu), value, options, 2).value > plan_tip("time", mu, 20).value
     with pytest.raises(SolverError):
-        plan_curves((tip_on(mu),), 1.03 * value, options, (2,), explained=False)
+        plan_curves(Task((tip_on(mu),), 1.03 * value, options, (2,)), explained=False)
 
 
 LIMITS = ("torque limit of finger 1", "torque limit of finger 2", "epsilon")
@@ -460,7 +460,7 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
     problem = problem_of(IMPACTS)
     chain = ImpactSequence(problem.phases, trace_phases(problem)).split()[0]
     with pytest.raises(InfeasibleError) as caught:
-        chain.plan(1.0, OPTIONS)
+        plan_curves(chain.make_task(1.0, OPTIONS))
     found = re.match(
         r"phases 1 to 3 are infeasible: c_n of (\S+) >= epsilon = 1 N is \S+ N short at "
         r"t = \d\.\d{4} s \(x = .*? mm, phi = .*? deg\), phase ([123])",
@@ -469,10 +469,10 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
     assert found is not None, str(caught.value)
     assert found[1] in chain.phases[int(found[2]) - 1].formation.names
     (value,) = read_advice(str(caught.value)).values()
-    assert all(plan.motion.duration > 0 for plan in chain.plan(value, OPTIONS))
+    assert all(plan.motion.duration > 0 for plan in plan_curves(chain.make_task(value, OPTIONS)))
     # Where only the fact counts, no time is spent on advice.
     with pytest.raises(SolverError, match=r"^phases 1 to 3: Ipopt stopped with "):
-        chain.plan(1.03 * value, OPTIONS, explained=False)
+        plan_curves(chain.make_task(1.03 * value, OPTIONS), explained=False)
 
 
 def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:

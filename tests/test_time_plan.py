@@ -32,7 +32,7 @@ from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weigh
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.nlp import Solver, build_solver
-from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.path_domain.path_plan import Task, plan_curves
 from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_nlp, time_plan
@@ -500,7 +500,7 @@ def test_a_part_of_a_block_starts_at_rest() -> None:
     """Although the plan of the whole block, its guess, passes there at speed."""
     own, options = problem("time"), PlanOptions(time_intervals=4)
     curves = ImpactSequence(own.phases, trace_phases(own)).continuous_curves
-    first, free = plan_curves(curves, own.epsilon, options, (1, 2))
+    first, free = plan_curves(Task(curves, own.epsilon, options, (1, 2)))
     assert np.abs(free.motion.evaluate(np.zeros(1)).z_dot).max() > 0.1
     z = first.motion.evaluate(np.array([first.motion.duration])).z[0]
     (part,) = plan_phases(own, own.phases[1:], z, options, free=[free])

@@ -23,7 +23,7 @@ from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain import path_data, path_motion, path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.path_domain.path_plan import Task, plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.scene.model import Scales
 
@@ -39,7 +39,7 @@ def plan_path(
     curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None = None
 ) -> PhasePlan[PathMotion]:
     """The plan of one phase along a curve, from rest to rest."""
-    return plan_curves((curve,), epsilon, options, (phase,), duration)[0]
+    return plan_curves(Task((curve,), epsilon, options, (phase,), duration))[0]
 
 
 @dataclass(frozen=True)

@@ -117,17 +117,11 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
     return np.column_stack([t, np.repeat([step.tau for step in steps], 2, axis=0)])
 
 
-@dataclass(frozen=True, eq=False)
-class Passage:
+class Passage(NamedTuple):
     """Phases that are carried in one motion."""
 
     phases: tuple[Phase, ...]
     after: Phase | None  # the one that follows; None after the last
-
-    @property
-    def until(self) -> Until:
-        """What ends it."""
-        return self.phases[-1].until
 
 
 def split_passages(problem: Problem) -> list[Passage]:
@@ -346,9 +340,10 @@ class PassageTuner:
         self, problem: Problem, passage: Passage, z: Array, options: TuningOptions
     ) -> None:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
-        self.end = EndDistance.to_leading(problem.scene, passage.until, z)
+        self.until = passage.phases[-1].until
+        self.end = EndDistance.to_leading(problem.scene, self.until, z)
         self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.limit, self.gains = problem.scene.torque_limit, passage.until.contact is not None
+        self.limit, self.gains = problem.scene.torque_limit, self.until.contact is not None
         scales, self.time = problem.scene.scales, problem.scene.scales.time
         self.slow = SETTINGS.slow * (scales.rate if self.end.unit == "rad" else scales.speed)
         # Two freedoms where the object arrives.
@@ -374,7 +369,7 @@ class PassageTuner:
     def tune(self) -> PhaseTuning:
         """Tune it."""
         phases = self.passage.phases
-        tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
+        tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
             text = "a coordinate is passed in motion; the rule tunes phases to rest"
             return replace(tuning, reason=text)
@@ -406,7 +401,7 @@ class PassageTuner:
         drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
             nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
-            text = f"no constant torques reach {self.passage.until}: the nearest trial "
+            text = f"no constant torques reach {self.until}: the nearest trial "
             text += nearest.to_text()
             why = "up to the torque limit"
             if last.outcome is TrialOutcome.LOSES:
@@ -440,7 +435,7 @@ class PassageTuner:
             own = self._sum_up(own, trial, steps=steps, end=None if text else z)
             if not text:
                 break
-            own = replace(own, reason=f"{self.passage.until} is reached at {rate}, and {text}")
+            own = replace(own, reason=f"{self.until} is reached at {rate}, and {text}")
         return own
 
     def _list_holds(self, trial: TuningTrial) -> list[tuple[float, float] | None]:

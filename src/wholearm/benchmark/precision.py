@@ -48,7 +48,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
 from ..planning.path_domain.path_motion import NODES, PathMotion, Profile, lay_out
-from ..planning.path_domain.path_plan import LimitShape, build_path_nlp, guess, plan_curves
+from ..planning.path_domain.path_plan import LimitShape, Task, build_path_nlp, guess, plan_curves
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
@@ -337,7 +337,8 @@ def make_course(instance: Instance, study: str) -> Course | None:
     if study == FEW:
         motion, degree = make_slow_motion(instance, 2, 0.3), 14
     else:
-        motion, degree = plan_curves((curve,), problem.epsilon, PlanOptions(), (1,))[0].motion, 6
+        task = Task((curve,), problem.epsilon, PlanOptions(), (1,))
+        motion, degree = plan_curves(task)[0].motion, 6
     looks = np.linspace(0.0, motion.duration, 201)
     if motion.evaluate(looks).c_n.min() <= 0:
         return None
@@ -404,7 +405,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data), len(data.grid.steps), Objective.TIME)
-    return lambda: plan_curves((curve,), epsilon, options, (1,))[0].torque
+    return lambda: plan_curves(Task((curve,), epsilon, options, (1,)))[0].torque
 
 
 def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:

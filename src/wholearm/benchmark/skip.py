@@ -19,7 +19,7 @@ import numpy as np
 
 from ..common.document import Table
 from ..geometry.tracing import load, trace_phases
-from ..planning.nlp import record_runs
+from ..planning.nlp import open_ledger
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..planning.time_domain.time_plan import plan_phases
@@ -126,7 +126,7 @@ def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
     It is that of planning, with options of `solve`, and of drawing the plan if that is asked for.
     """
     started = time.process_time()
-    with record_runs() as runs:
+    with open_ledger() as ledger:
         if options.get("transcription") == "time":
             # Not from the plan along curves, whose NLPs are others.
             plan_phases(problem, problem.phases, problem.start, PlanOptions(**options))
@@ -136,6 +136,6 @@ def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
         from ..figures.plots import force_margins
 
         force_margins(solution).canvas.draw()
-    whole, solving = time.process_time() - started, sum(run.seconds for run in runs)
-    sizes = runs[0].unknowns, runs[0].rows
+    whole, solving = time.process_time() - started, sum(run.seconds for run in ledger.runs)
+    sizes = ledger.runs[0].unknowns, ledger.runs[0].rows
     return dict(zip(COLUMNS, (*sizes, whole - solving, solving), strict=True))

@@ -47,8 +47,10 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
     return run
 
 
-def stored(identify: Callable[..., Hashable]) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
-    """Have a function keep what it builds of CasADi objects, the values that were used last.
+def stored(
+    identify: Callable[..., Hashable], most: int = KEPT
+) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
+    """Have a function keep what it builds of CasADi objects, `most` values that were used last.
 
     Arguments for which `identify` gives equal keys share one value.
     """
@@ -63,7 +65,7 @@ def stored(identify: Callable[..., Hashable]) -> Callable[[Callable[..., _T]], C
             if key not in values:
                 values[key] = build(*owners)
             values.move_to_end(key)
-            if len(values) > KEPT:
+            if len(values) > most:
                 values.popitem(last=False)
             return values[key]
 

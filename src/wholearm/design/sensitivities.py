@@ -126,8 +126,7 @@ def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
     assert block.chain is not None
     iterates, options = list[path_plan.PathIterate](), planning.options
     for part in block.chain.split():
-        numbers, epsilon = [phase.number for phase in part.phases], planning.problem.epsilon
-        task = path_plan.Task(part.continuous_curves, epsilon, options, numbers, None)
+        task = part.make_task(planning.problem.epsilon, options)
         iterates.append(path_plan.plan_task(task))
     value = sum(iterate.objective for iterate in iterates)
     if abs(value - sum(plan.value for plan in block.plans)) > 1e-9 * value:
@@ -151,7 +150,7 @@ def _evaluate_path(
     iterate: path_plan.PathIterate, curves: Sequence[Curve], epsilon: float
 ) -> Terms:
     """Terms of a solution along other curves, on elements between the same reversals."""
-    task, nlp, units, made = iterate.task, iterate.nlp, iterate.units, iterate.solution
+    task, nlp, units = iterate.task, iterate.nlp, iterate.units
     parts = list[path_data.PhaseData]()
     last = len(curves) - 1
     for k, (part, curve, phase) in enumerate(zip(iterate.parts, curves, task.phases, strict=True)):
@@ -163,12 +162,11 @@ def _evaluate_path(
         moved = path_motion.lay_out(edges, segment, (k == 0, k == last), task.is_held)
         parts.append(path_data.prepare(curve, epsilon, moved, phase))
     data = path_data.join(parts)
-    x = path_plan.pack(nlp, made.profile, units, made.margin, iterate.data.grid.sizes)
-    p = path_plan.parameters(nlp, data, units, task.options.time_weight)
-    bounds = path_plan.make_bounds(nlp, data, units, iterate.tightening)
+    other = replace(iterate, data=data)
+    x, p, bounds = iterate.pack(), other.find_parameters(), other.make_bounds()
     f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
-    of_x = _charge(made.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
-    of_g = _charge(made.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])
+    of_x = _charge(iterate.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
+    of_g = _charge(iterate.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])
     unit = units.time * (units.power if task.options.goal is Objective.EFFORT else 1.0)
     limits = of_g[nlp.g["limits"]].reshape(len(data.grid.s), -1).sum(axis=0).tolist()
     speeds = " and ".join(limit.parameter.name for limit in data.speeds.limits)

@@ -38,7 +38,7 @@ from ..results.trajectory import Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.path_plan import plan_curves
+from .path_domain.path_plan import Pins, Task, plan_curves
 from .phase_plan import (
     PER_SPEED,
     Plans,
@@ -138,11 +138,24 @@ def plan_blocks(
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Plan block after block, but for those that are planned and not coarse."""
+    """Plan block after block, but for those that are planned and not coarse.
+
+    InfeasibleError if a phase cannot keep epsilon in its share of a longest duration.
+    """
     made, count = replace(planning, blocks=()), len(split_blocks(planning.problem))
     for _, block in zip_longest(range(count), planning.blocks):
         made = plan_next(made, block, report)
-    return _require_margin(made)
+    epsilon = planning.problem.epsilon
+    rounding = 5e-7 * planning.problem.scene.scales.force
+    late = planning.options.goal is Objective.MARGIN
+    for phase, plan in zip(planning.problem.phases, made.plans, strict=True):
+        if late and plan.value < epsilon - rounding:
+            raise InfeasibleError(
+                f"phase {phase.number}: in its share of the duration, "
+                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
+                f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
+            )
+    return made
 
 
 def plan_next(
@@ -216,7 +229,8 @@ def plan_block(
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
-            plans += part.plan(problem.epsilon, options, planning.allow(part.phases))
+            longest = planning.allow(part.phases)
+            plans += plan_curves(part.make_task(problem.epsilon, options, longest))
     return plans, chain
 
 
@@ -322,22 +336,6 @@ def plan_free(
         from .explain import explain_motors
 
         raise explain_motors(planning.problem.scene, block, [], error) from None
-
-
-def _require_margin(planning: Planning) -> Planning:
-    """The planning, or an error for a phase that cannot keep epsilon in its duration."""
-    if planning.options.goal is not Objective.MARGIN:
-        return planning
-    epsilon = planning.problem.epsilon
-    rounding = 5e-7 * planning.problem.scene.scales.force
-    for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
-        if plan.value < epsilon - rounding:
-            raise InfeasibleError(
-                f"phase {phase.number}: in its share of the duration, "
-                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
-                f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
-            )
-    return planning
 
 
 def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:
@@ -477,13 +475,16 @@ class ImpactSequence:
         pairs = zip(self.curves, ratios.tolist(), strict=True)
         return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
-    def plan(
-        self, epsilon: float, options: PlanOptions, duration: float | None = None, **others: Any
-    ) -> Plans:
-        """Plan phases that possible impacts join, from rest to rest; see `plan_curves`."""
+    def make_task(
+        self,
+        epsilon: float,
+        options: PlanOptions,
+        duration: float | None = None,
+        pins: Pins = (None, None),
+    ) -> Task:
+        """Phases that possible impacts join, from rest to rest."""
         numbers = [phase.number for phase in self.phases]
-        curves = self.continuous_curves
-        return [*plan_curves(curves, epsilon, options, numbers, duration, **others)]
+        return Task(self.continuous_curves, epsilon, options, numbers, duration, pins=pins)
 
     def estimate(self, epsilon: float) -> float:
         """Estimated least time [s], with stops where impacts are not possible."""
@@ -541,7 +542,7 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
         if duration is not None and junction is not None:
             duration -= junction.change.duration
         with charge(number):
-            plan = part.plan(epsilon, options, duration, pins=pins)
+            plan: Plans = [*plan_curves(part.make_task(epsilon, options, duration, pins))]
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)
         plans += plan

@@ -46,21 +46,8 @@ from ..scene.model import Scales, Scene
 from .dwell import require_hold
 from .nlp import open_ledger
 from .options import Objective, PlanOptions
-from .path_domain.path_data import PhaseData, cut, fit_torque, join
-from .path_domain.path_motion import PathMotion
-from .path_domain.path_plan import (
-    LimitShape,
-    Task,
-    Tightening,
-    build_path_nlp,
-    guess_slowly,
-    make_bounds,
-    pack,
-    parameters,
-    plan_curves,
-    plan_task,
-    unpack,
-)
+from .path_domain.path_data import fit_torque
+from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -218,31 +205,23 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     Torque rate limits, or else limits of which the least violation is found with soft ones.
     `stopped` says in words how the solver ended.
     """
-    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
     if task.is_held:
-        return _explain_rate_limits(task, parts, stopped)
-    data, torque = join(parts), task.curves[0].formation.scene.scales.torque
-    profile, units = guess_slowly(data)
-    units = units._replace(torque=np.full(2, 15.0 * torque))  # as bad as one of force
-    short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
-    short += 0.05 * data.limits.scales
-    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, Objective.ELASTIC)
-    x0 = pack(nlp, profile, units, short / units.of(data.limits))
-    bounds = make_bounds(nlp, data, units, Tightening.none(data, None))
-    result = nlp.solver(x0=x0, p=parameters(nlp, data, units, 1.0), **bounds)
-    if not nlp.solver.stats()["success"]:
+        return _explain_rate_limits(task, stopped)
+    try:
+        elastic = PathIterate.elastic(task).solve()
+    except SolverError:
         return SolverError(stopped)
-    elastic, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-    motions, torques = list[PathMotion](), list[TorqueProfile]()
-    shortfalls, missing = list[Shortfall](), None
-    for part, part_profile, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
-        motions.append(PathMotion(part.curve, part.grid, part_profile))
+    data, parts = elastic.data, elastic.parts
+    torques, shortfalls, missing = list[TorqueProfile](), list[Shortfall](), None
+    for part, motion, phase in zip(parts, elastic.motions, task.phases, strict=True):
         suffix = f", phase {phase}" if len(parts) > 1 else ""
-        nodes = zip(motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
+        nodes = zip(motion.times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
         places = [
             LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}") for t, z in nodes
         ]
-        shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, part_profile), places)
+        shortfalls += find_shortfalls(
+            part.limits, part.evaluate(part.nodes, motion.profile), places
+        )
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
@@ -258,9 +237,11 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         return () if least is None else list_beyond(parameter, least)
 
     with suppress(SolverError):  # it stalls
-        torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
+        torques = [fit_torque(*pair)[0] for pair in zip(parts, elastic.motions, strict=True)]
         formations = [part.curve.formation for part in parts]
-        missing = assemble_motions(motions, torques, formations, 201, status="misses limits least")
+        missing = assemble_motions(
+            elastic.motions, torques, formations, 201, status="misses limits least"
+        )
     error = rank(task.phases, shortfalls, missing)
     return advise(error, may_change, list_values, partial(_replan_task, task))
 
@@ -320,17 +301,18 @@ def explain_jam(task: Task, jam: JammingError) -> JammingError:
     return advise(jam, lower, list_frictions_to_try, partial(_replan_task, task))
 
 
-def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) -> WholearmError:
+def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
     """The error for phases without a plan under rate limits and lags.
 
     It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
     are tried.
     """
     scene = task.curves[0].formation.scene
+    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
 
-    def plan(scene: Scene, *others: Any) -> Scene:
+    def plan(scene: Scene, pins: Pins = (None, None), explained: bool = True) -> Scene:
         curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]
-        plan_curves(curves, task.epsilon, task.options, task.phases, task.duration, *others)
+        plan_curves(replace(task, curves=curves, guides=(), pins=pins), explained)
         return scene
 
     try:
@@ -341,7 +323,7 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
         return error
     for factor in (2.0, 10.0, 100.0):
         with suppress(WholearmError):
-            quick = plan(scene.quicken(factor), False, task.pins)
+            quick = plan(scene.quicken(factor), task.pins, explained=False)
             return refuse_motors(scene, quick, task.phases, reason)
     return refuse_motors(scene, None, task.phases, reason)
 

@@ -203,9 +203,9 @@ def _bound(
     cap = join_caps(left.cap, right.cap)
     motion = speed_sweep(middle, np.diff(s), part[:, 1], cap, b_guess)
     b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
-    costate = find_costate(path, grid, left, right, motion)
+    y, slopes = find_costate(path, grid, left, right, motion)
     shape = len(h), len(_PLACES) - 3
-    p, slope = (part.ravel() for part in costate.interpolate(path, grid, _PLACES[3:]))
+    p, slope = map(np.ravel, interpolate_costate(path, grid, y, slopes, _PLACES[3:]))
     inner = rows.pick((slice(None), slice(3, None)))
     inner = PathLimits(*(array.reshape(-1, *array.shape[2:]) for array in inner))
     least = find_least(inner, p, slope)
@@ -221,7 +221,8 @@ def _bound(
     )
     error = np.abs(fine - coarse)
     losses = error + np.abs(h[:, 0] / 2 * (excess[:, 2:] @ _RULES[1][1]))
-    jumps = np.minimum(costate.jumps(grid), 0.0)
+    # Where p falls from one interval to the next.
+    jumps = np.minimum((y[:-1, 1] - y[1:, 0]) / np.sin(grid.angles[1:-1]), 0.0)
     taken = np.zeros(len(jumps))
     at = np.flatnonzero(jumps)
     taken[at] = np.minimum(right.pick(at).find_largest_b(), left.pick(at + 1).find_largest_b())
@@ -235,34 +236,13 @@ def _bound(
     return LowerBound(value, estimate), losses, motion, time
 
 
-class Costate(NamedTuple):
-    """y = p sin(angle) at the two ends of each interval, and its slopes there, (N, 2) each."""
-
-    y: Array
-    slopes: Array
-
-    def interpolate(self, path: PathTerms, grid: PathGrid, fractions: Array) -> tuple[Array, Array]:
-        """The costate p and p' = dp/ds at `fractions` of every interval, shape (N, n)."""
-        t, h = fractions, np.diff(grid.angles)[:, None]
-        (start, stop), (first, last) = self.y.T[..., None], h * self.slopes.T[..., None]
-        rise = stop - start
-        bow = first + last - 2 * rise
-        y = start + t * (first + t * (rise - first - bow + t * bow))
-        y_t = first + t * (2 * (rise - first - bow) + 3 * t * bow)
-        angles = grid.angles[:-1, None] + t * h
-        sine = np.sin(angles)
-        p_angle = (y_t / h - y / np.tan(angles)) / sine
-        return y / sine, p_angle / (path.length / 2 * sine)
-
-    def jumps(self, grid: PathGrid) -> Array:
-        """By how much p falls at each inner node, shape (N - 1,)."""
-        return np.asarray((self.y[:-1, 1] - self.y[1:, 0]) / np.sin(grid.angles[1:-1]))
-
-
 def find_costate(
     path: PathTerms, grid: PathGrid, left: PathLimits, right: PathLimits, motion: SpeedProfile
-) -> Costate:
-    """The costate of a profile, from the limits at the left and right ends of intervals."""
+) -> tuple[Array, Array]:
+    """The costate p of a profile, from the limits at the left and right ends of intervals.
+
+    Returns y = p sin(angle) at the two ends of each interval, and its slopes there, (N, 2) each.
+    """
     b, modes = motion.b, motion.modes
     pushes, brakes = (
         (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
@@ -314,7 +294,23 @@ def find_costate(
     secant = np.diff(y, axis=1)[:, 0] / steps
     slopes[0, 0] = 2 * secant[0] - slopes[0, 1]
     slopes[-1, 1] = 2 * secant[-1] - slopes[-1, 0]
-    return Costate(y, slopes)
+    return y, slopes
+
+
+def interpolate_costate(
+    path: PathTerms, grid: PathGrid, y: Array, slopes: Array, fractions: Array
+) -> tuple[Array, Array]:
+    """The costate p and p' = dp/ds at `fractions` of every interval, shape (N, n)."""
+    t, h = fractions, np.diff(grid.angles)[:, None]
+    (start, stop), (first, last) = y.T[..., None], h * slopes.T[..., None]
+    rise = stop - start
+    bow = first + last - 2 * rise
+    y_t = first + t * (2 * (rise - first - bow) + 3 * t * bow)
+    y = start + t * (first + t * (rise - first - bow + t * bow))
+    angles = grid.angles[:-1, None] + t * h
+    sine = np.sin(angles)
+    p_angle = (y_t / h - y / np.tan(angles)) / sine
+    return y / sine, p_angle / (path.length / 2 * sine)
 
 
 def find_least(limits: PathLimits, p: Array, slope: Array) -> Array:

@@ -10,25 +10,24 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import astuple, dataclass
-from functools import wraps
 from operator import add
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression, Numbers
+from ..common.sharing import stored
 from ..common.signals import beat, check
 from ..contacts.formation import Formation
 
 Indices = Numbers
 Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
-_K = TypeVar("_K")
 STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
 _OPTIONS = {
     "print_level": 0,
@@ -119,20 +118,12 @@ def build_kernel(x: Symbols, p: Symbols | None = None, **y: Expression) -> Kerne
     )
 
 
-def share(build: Callable[..., _K]) -> Callable[..., _K]:
-    """Keep the last 64 kernels, each for all formations with the same equations."""
-    kept = dict[tuple[Any, ...], _K]()
+def _identify(*args: Any) -> tuple[Any, ...]:
+    return tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
 
-    @wraps(build)
-    def find(*args: Any) -> _K:
-        key = tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
-        # The latest are last.
-        kept[key] = kept.pop(key) if key in kept else build(*args)
-        if len(kept) > 64:
-            del kept[next(iter(kept))]
-        return kept[key]
 
-    return find
+share = stored(_identify, most=64)
+"""Has a function keep its last kernels, each for all formations with the same equations."""
 
 
 class _Block(NamedTuple):
@@ -320,21 +311,6 @@ class IpoptRun(NamedTuple):
     seconds: float  # [s]: processor time
 
 
-_RECORDS: list[list[IpoptRun]] = []
-
-
-@contextmanager
-def record_runs() -> Iterator[list[IpoptRun]]:
-    """Collect the runs of all solvers until the end of a `with` statement."""
-    runs: list[IpoptRun] = []
-    _RECORDS.append(runs)
-    try:
-        yield runs
-    finally:
-        # `list.remove` would take any record with the same runs.
-        _RECORDS[:] = [record for record in _RECORDS if record is not runs]
-
-
 class Solver:
     """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
 
@@ -352,16 +328,14 @@ class Solver:
         result: dict[str, Expression] = self.function(**lists)
         stats = self.function.stats()
         # A solver that was stopped does not always say what it has done.
-        cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
-        book(SolverStatistics(solves=1, iterations=cost[0], solve_time=cost[1]))
-        if _RECORDS:
-            get = self.function.get_function
-            jacobian, hessian = get("nlp_jac_g"), get("nlp_hess_l")
-            sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
-            nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
-            run = IpoptRun(*sizes, *nonzeros, stats["iter_count"], stats["t_proc_total"])
-            for runs in _RECORDS:
-                runs.append(run)
+        count, *times = (
+            stats.get(key, 0) for key in ("iter_count", "t_wall_total", "t_proc_total")
+        )
+        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
+        sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
+        nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
+        run = IpoptRun(*sizes, *nonzeros, count, times[1])
+        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]), run)
         check()
         if stats["return_status"] == STOPPED:
             raise KeyboardInterrupt
@@ -386,8 +360,14 @@ class SolverStatistics:
         return SolverStatistics(*map(add, astuple(self), astuple(other)))
 
 
-Ledger = defaultdict[int, SolverStatistics]
-"""Costs by the number of the phase that they were for; 0 stands for none in particular."""
+class Ledger(defaultdict[int, SolverStatistics]):
+    """Costs by the number of the phase that they were for, 0 for none; `runs` of all solvers."""
+
+    def __init__(self) -> None:
+        super().__init__(SolverStatistics)
+        self.runs = list[IpoptRun]()
+
+
 _LEDGERS: ContextVar[tuple[Ledger, ...]] = ContextVar("ledgers", default=())  # those that are open
 _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 
@@ -395,7 +375,7 @@ _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 @contextmanager
 def open_ledger() -> Iterator[Ledger]:
     """Collect what solving costs inside the block."""
-    ledger = Ledger(SolverStatistics)
+    ledger = Ledger()
     token = _LEDGERS.set((*_LEDGERS.get(), ledger))
     try:
         yield ledger
@@ -413,7 +393,8 @@ def charge(phase: int) -> Iterator[None]:
         _PHASE.reset(token)
 
 
-def book(cost: SolverStatistics) -> None:
-    """Add a cost to all ledgers that are open."""
+def book(cost: SolverStatistics, *runs: IpoptRun) -> None:
+    """Add a cost, and the runs that it is of, to all ledgers that are open."""
     for ledger in _LEDGERS.get():
         ledger[_PHASE.get()] += cost
+        ledger.runs.extend(runs)

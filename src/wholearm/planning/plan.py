@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -30,10 +30,10 @@ from ..results.trajectory import Trajectory
 from ..verification.verify import EXACT_REST, find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
-from .nlp import Ledger, charge, open_ledger
+from .nlp import charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
-from .path_domain.path_plan import Task, plan_curves
+from .path_domain.path_plan import plan_curves
 from .phase_plan import PlanPart, Plans, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
@@ -144,7 +144,24 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             report("bounding the least time from below")
             certificate = certify(planning)
         gaps = certificate.gaps if certificate else {}
-        phases = _list_phases(planning, ledger, unique, gaps)
+        phases = tuple(
+            PlannedPhase(
+                phase.number,
+                ledger[phase.number],
+                plan.value,
+                plan.motion.duration,
+                tuple(contact.name for contact in phase.formation.rolling),
+                getattr(plan.motion, "modes", ()),
+                plan.sequences,
+                plan.complete,
+                plan.attempt,
+                gaps.get(phase.number, plan.error),
+                *unique[phase.index],
+                plan.settling,
+                None if math.isnan(plan.unheld) else plan.unheld,
+            )
+            for phase, plan in zip(problem.phases, planning.settled, strict=True)
+        )
         plan = Plan(
             problem,
             options,
@@ -172,29 +189,6 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             ranges,
         )
         return replace(plan, trajectory=replace(plan.trajectory, meta=write_meta(plan)))
-
-
-def _list_phases(
-    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness], gaps: Mapping[int, float]
-) -> tuple[PlannedPhase, ...]:
-    return tuple(
-        PlannedPhase(
-            phase.number,
-            ledger[phase.number],
-            plan.value,
-            plan.motion.duration,
-            tuple(contact.name for contact in phase.formation.rolling),
-            getattr(plan.motion, "modes", ()),
-            plan.sequences,
-            plan.complete,
-            plan.attempt,
-            gaps.get(phase.number, plan.error),
-            *unique[phase.index],
-            plan.settling,
-            None if math.isnan(plan.unheld) else plan.unheld,
-        )
-        for phase, plan in zip(planning.problem.phases, planning.settled, strict=True)
-    )
 
 
 def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
@@ -233,7 +227,7 @@ def _plan_part(
     chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *others: Any
 ) -> Plans:
     """Plan phases `start` to `stop` of a chain, from rest at their curve's start: a `PlanPart`."""
-    return chain.part(start, stop).plan(epsilon, *others, explained=False)
+    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *others), explained=False)]
 
 
 def _find_saving(
@@ -316,7 +310,7 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
         motions = (planning.plans[number - 1].motion for number in numbers)
         guides = [Guide(m.grid.s, *m.profile) for m in motions if isinstance(m, PathMotion)]
         report(f"looking for the widest ranges of phase {numbers[0]}")
-        widest |= dict.fromkeys(numbers, _find_widest(planning, part, numbers, guides, most))
+        widest |= dict.fromkeys(numbers, _find_widest(planning, part, guides, most))
     if not widest:
         return figures
     each, least = tuple(widest.get(phase.number) for phase in problem.phases), min(widest.values())
@@ -324,11 +318,7 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
 
 
 def _find_widest(
-    planning: Planning,
-    part: ImpactSequence,
-    numbers: Sequence[int],
-    guides: list[Guide],
-    most: float,
+    planning: Planning, part: ImpactSequence, guides: list[Guide], most: float
 ) -> float:
     """The largest factor on ranges, up to `most`, with which phases have a plan; zero for none.
 
@@ -337,22 +327,22 @@ def _find_widest(
     """
     from .robust.robust_rows import Guide
 
-    curves, problem = part.continuous_curves, planning.problem
+    first = part.make_task(planning.problem.epsilon, planning.options)
 
     def scale(factor: float) -> PlanOptions:
-        wider = planning.options.scale_ranges(problem.ranges, factor)
+        wider = planning.options.scale_ranges(planning.problem.ranges, factor)
         return replace(wider, objective=Objective.TIME, duration=None)
 
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > 0.01 * high):  # relatively
-        task = Task(curves, problem.epsilon, scale(middle), numbers, None, guides=tuple(guides))
+        task = replace(first, options=scale(middle), guides=tuple(guides))
         fastest = task.find_fastest()
         if fastest is None:
             high = middle
         else:
             # The minimum-time profile along each curve.
             low, start, guides = middle, 0.0, []
-            for curve in curves:
+            for curve in first.curves:
                 s = np.linspace(0.0, curve.length, len(fastest.s))
                 b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
                 guides.append(Guide(s, none, b, none))
@@ -360,7 +350,7 @@ def _find_widest(
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(8):  # most plans that are tried
         try:
-            plan_curves(curves, problem.epsilon, scale(low).roughen(), numbers, explained=False)
+            plan_curves(replace(first, options=scale(low).roughen()), explained=False)
             return low
         except (InfeasibleError, SolverError):
             low *= 0.98  # factor from one tried plan to the next

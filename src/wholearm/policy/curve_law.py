@@ -93,7 +93,7 @@ class CurveLaw:
     passed        how many of the phases have been passed
     turn          first chord of the next law, if it is along a curve and entered in motion
     brake, after  the next law, if it is along a curve: while `push` is held, or otherwise
-    s, v, level   arc length, speed and least level at the last step
+    s, v          arc length and speed at the last step
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class CurveLaw:
         self.passed = len(self.starts) - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
-        self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
+        self.s, self.v = self.nodes[self.j], 0.0
         self.off, self.fresh = 0.0, not at_end
         if self.sensing is not None:
             self.sensing.begin()
@@ -292,14 +292,14 @@ class CurveLaw:
         """
         rows, torques = (_evaluate(table[j], share, v) for table in (self.levels, self.torque))
         wanted, floor = a, self.floor[j]
-        a, level, internal = _choose_motion(rows, planned, wanted, floor)
+        a, _, internal = _choose_motion(rows, planned, wanted, floor)
         if across is not None:
             rows += self._list_levels_across(torques, across, float(across < j), v)
             both = _choose_motion(rows, planned, wanted, floor)
             # Where none keep both, the longer part counts. Case: query 32, phase 6.
             if both[1] > 0.0:
-                a, level, internal = both
-        self.a, self.level = a, level
+                a, _, internal = both
+        self.a = a
         tau = [(moving + by_a * a, by) for moving, by_a, by in torques]
         low, high = -1e30, 1e30
         one, two = self.settings.limit

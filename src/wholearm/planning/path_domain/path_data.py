@@ -227,13 +227,6 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     )
 
 
-def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
-    """Return the profile of each of several joined phases."""
-    ends = np.cumsum([len(part.grid.s) for part in parts])[:-1]
-    columns = (np.split(values, ends) for values in profile)
-    return [Profile(*part) for part in zip(*columns, strict=True)]
-
-
 def choose_sampling(nodes: int) -> Sampling:
     """More knots and checks where intervals are long.
 

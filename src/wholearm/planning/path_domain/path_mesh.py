@@ -93,11 +93,6 @@ class Fastest(NamedTuple):
     b: Array  # (N + 1,) [m^2/s^2]
     switches: Array  # [m]: where another limit becomes active
 
-    @property
-    def slopes(self) -> tuple[Array, Array]:
-        """Middles of the intervals [m] and the s'' of each, shape (N,) [m/s^2]."""
-        return (self.s[1:] + self.s[:-1]) / 2, np.diff(self.b) / (2 * np.diff(self.s))
-
 
 def find_fastest(data: PhaseData) -> Fastest | None:
     """The minimum-time profile by a reachability sweep; None if there is no motion.

@@ -31,7 +31,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,7 +49,7 @@ from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
-from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
+from .path_data import PhaseData, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
     equidistribute,
@@ -59,17 +59,7 @@ from .path_mesh import (
     keep_apart,
     make_grid,
 )
-from .path_motion import (
-    DEGREE,
-    NODES,
-    Elements,
-    Grid,
-    PathMotion,
-    Profile,
-    find_basis,
-    follow,
-    list_maps,
-)
+from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basis, follow, list_maps
 
 if TYPE_CHECKING:
     from ..robust.robust_rows import Guide, RobustLimits
@@ -84,25 +74,10 @@ WORTH = 0.02  # largest relative cost of a start that friction cannot hold (`Sur
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
-def plan_curves(
-    curves: Sequence[Curve],
-    epsilon: float,
-    options: PlanOptions,
-    phases: Sequence[int],
-    duration: float | None = None,
-    explained: bool = True,
-    pins: Pins = (None, None),
-) -> Plans:
+def plan_curves(task: Task, explained: bool = True) -> Plans:
     """Plan phases along curves that are run through one after the other, from rest to rest.
 
-    Parameters
-    ----------
-    curves          with speed ratios that make the speed continuous where two of them meet
-    epsilon : [N]   least normal force
-    phases          the phases' numbers, for messages
-    duration : [s]  longest duration of all, for the objective `margin`
-    explained       whether to find out why there is no plan, which takes longer than planning
-    pins : [N]      prescribed internal force at both ends, if any
+    Without a plan it is `explained` why there is none, which takes longer than planning.
 
     Raises
     ------
@@ -112,7 +87,7 @@ def plan_curves(
                      contact forces are not unique
     SolverError      if the solver does not converge
     """
-    task = Task(curves, epsilon, options, phases, duration, pins=pins)
+    options, phases = task.options, task.phases
     try:
         if options.ranges:
             # Rows are for the motion of a reference: first of a plan without ranges.
@@ -120,7 +95,7 @@ def plan_curves(
             task = replace(task, guides=nominal.guides)
         iterate = _plan_within(task)
     except JammingError as jam:
-        if not explained or len(curves) > 1:
+        if not explained or len(task.curves) > 1:
             raise
         from ..explain import explain_jam
 
@@ -138,13 +113,13 @@ def plan_curves(
                 "number as it is"
             ) from None
         raise error from None
-    rounding = MISS * curves[0].formation.scene.scales.force
-    if options.goal is Objective.MARGIN and iterate.plans[0].value < epsilon - rounding:
-        if duration is not None:
+    rounding = MISS * task.curves[0].formation.scene.scales.force
+    if options.goal is Objective.MARGIN and iterate.plans[0].value < task.epsilon - rounding:
+        if task.duration is not None:
             fastest = replace(options, objective=Objective.TIME, duration=None)
             least = plan_task(replace(task, options=fastest, duration=None)).plans
             where = f"{name_phases(phases, 'infeasible')}: "
-            share_duration([plan.value for plan in least], duration, where)
+            share_duration([plan.value for plan in least], task.duration, where)
         raise SolverError(f"{name_phases(phases)}: the margin found is below epsilon")
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
@@ -259,15 +234,15 @@ def find_sure_start(
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of `plan_curves`; with ranges also a reference for each curve."""
+    """Phases along curves that are planned as one."""
 
-    curves: Sequence[Curve]
-    epsilon: float
+    curves: Sequence[Curve]  # with speed ratios that make the speed continuous where two meet
+    epsilon: float  # [N]: least normal force
     options: PlanOptions
-    phases: Sequence[int]
-    duration: float | None
+    phases: Sequence[int]  # the phases' numbers, for messages
+    duration: float | None = None  # [s]: longest one of all, for the objective `margin`
     start: SureStart | None = None
-    guides: tuple[Guide, ...] = ()
+    guides: tuple[Guide, ...] = ()  # with ranges a reference for each curve
     pins: Pins = (None, None)
 
     @cached_property
@@ -334,16 +309,6 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
         raise AmbiguityError(f"phase {phase}: {text}")
 
 
-class PathSolution(NamedTuple):
-    """A solution of the NLP, or the point to start from."""
-
-    profile: Profile
-    margin: float  # [N]: over epsilon
-    multipliers: dict[str, Array]
-    cost: float = np.inf  # in the units of the NLP
-    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
-
-
 @dataclass(frozen=True)
 class PathIterate:
     """A mesh with its NLP, and the solution on it or the point to start from."""
@@ -353,8 +318,12 @@ class PathIterate:
     data: PhaseData  # all phases as one
     nlp: PathNLP
     units: Units
-    solution: PathSolution
+    profile: Profile
+    margin: float  # [N]: over epsilon
     tightening: Tightening  # of the limits for that
+    multipliers: dict[str, Array] = field(default_factory=dict)  # empty at a point to start from
+    cost: float = np.inf  # in the units of the NLP
+    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
     meshes: int = 0  # before this one
     before: PathIterate | None = None  # the solution on the mesh before
 
@@ -380,17 +349,32 @@ class PathIterate:
 
     @staticmethod
     def on(
-        task: Task, parts: list[PhaseData], units: Units, profile: Profile, margin: float
+        task: Task,
+        parts: list[PhaseData],
+        units: Units,
+        profile: Profile,
+        margin: float,
+        goal: Objective | None = None,
     ) -> PathIterate:
         """The NLP on the elements of phases, near a motion and its margin [N].
 
-        Multipliers are those near the central path.
+        Its objective is that of the task if left out.
         """
         data = join(parts)
-        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), task.options.goal)
-        first = PathSolution(profile, margin, center(nlp, data, units, profile, margin))
-        none = Tightening.none(data, task.duration)
-        return PathIterate(task, parts, data, nlp, units, first, none)
+        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal or task.options.goal)
+        none = np.zeros((len(data.grid.s), len(data.spans)))
+        tightening = Tightening(none, none, np.ones((len(none), 5)), task.duration)
+        return PathIterate(task, parts, data, nlp, units, profile, margin, tightening)
+
+    @staticmethod
+    def elastic(task: Task) -> PathIterate:
+        """The problem with soft limits, from a slow motion whatever they are."""
+        data = join(parts := task.lay_out([np.zeros(0)] * len(task.curves), task.elements))
+        profile, units = _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+        # A shortfall of torque is as bad as one of force.
+        torque = np.full(2, 15.0 * data.curve.formation.scene.scales.torque)
+        units = units._replace(torque=torque)
+        return PathIterate.on(task, parts, units, profile, 0.0, Objective.ELASTIC)
 
     def restart(self) -> PathIterate | None:
         """The solution on the mesh before with tightened limits, or more elements, once."""
@@ -403,32 +387,146 @@ class PathIterate:
 
     def solve(self) -> PathIterate:
         """The solution on this mesh."""
-        nlp, data, units, start, task = self.nlp, self.data, self.units, self.solution, self.task
-        bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
+        nlp, units, bounds = self.nlp, self.units, self.make_bounds()
         if (bounds["lbg"] > bounds["ubg"]).any():
             raise SolverError("limits that hold between the nodes too leave nothing")
-        solver = nlp.starter if np.isinf(start.cost) else nlp.solver
-        result = solver(
-            x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
-            p=parameters(nlp, data, units, task.options.time_weight),
-            **bounds,
-            **start.multipliers,
-        )
+        solver = nlp.solver if self.multipliers else nlp.starter
+        bounds |= self.multipliers or self._center()
+        result = solver(x0=self.pack(), p=self.find_parameters(), **bounds)
         stats = solver.stats()
         if not stats["success"]:
             raise SolverError(f"Ipopt stopped with {stats['return_status']}")
-        profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
-        solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
-        return replace(self, solution=solution)
+        # b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
+        x, table = result["x"].full()[:, 0], np.zeros(nlp.free.shape)
+        table[nlp.free] = x
+        profile = follow(self.data.grid, *(table[:, [1, 2]] * units.profile[1:]).T)
+        margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
+        return replace(
+            self,
+            profile=profile,
+            margin=margin,
+            multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
+            cost=float(result["f"]),
+            duration=float(result["g"][-1]) * units.time if self.tightening.duration else 0.0,
+        )
+
+    def pack(self) -> Array:
+        """Unknowns of the NLP, in its units, of the motion to start from.
+
+        Soft limits may be missed by somewhat more than it misses them.
+        """
+        nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
+        table = np.empty(nlp.free.shape)
+        table[:, nlp.node["extra"]] = self.margin / units.force
+        if nlp.objective is Objective.ELASTIC:
+            short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
+            short += 0.05 * data.limits.scales
+            table[:, nlp.node["extra"]] = short / units.of(data.limits)
+        table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
+        table[:, 0] /= data.grid.sizes
+        return np.asarray(table[nlp.free])
+
+    def find_parameters(self) -> Array:
+        """Parameters of the NLP, in its units."""
+        nlp, data, units = self.nlp, self.data, self.units
+        terms, unit = data.find_terms(), units.of(data.limits)
+        b_unit, a_unit, force = units.profile
+        torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
+        blocks = {
+            "steps": data.grid.steps / units.length,
+            "weight": np.array([self.task.options.time_weight / units.power]),
+            "calm": np.array([force / units.press]),
+            "a": terms[..., A] * a_unit / unit,
+            "b": terms[..., B] * b_unit / unit,
+            "lam": terms[..., LAMBDA] * force / unit,
+            "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
+            "torque": data.nodes.forces.of_tau[..., ONE] / torque,
+            "joints": torque**2 / units.power,
+            "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
+            "lags": scene.actuator_lag[list(shape.commands)] / units.time,
+            "maps": data.grid.maps,
+            "sizes": data.grid.sizes,
+        }
+        return np.asarray(nlp.p.join(**{name: block.ravel("F") for name, block in blocks.items()}))
+
+    def make_bounds(self) -> dict[str, Array]:
+        """Bounds of the NLP, with every limit tightened."""
+        nlp, data, units, tightening = self.nlp, self.data, self.units, self.tightening
+        start, pins = self.task.start, self.task.pins
+        share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
+        n, node = len(data.grid.s), nlp.node
+        low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
+        b_max = data.largest_b(data.nodes)
+        # Next to rest b is 2 s times the least s''.
+        s, length = data.grid.s, data.grid.s[-1]
+        low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
+        high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
+        if data.grid.held:
+            low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
+        # From rest to rest, without reversal.
+        if nlp.shape.slow:
+            low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+        else:
+            low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+        if start is not None:
+            _, a_unit, force = units.profile
+            low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
+            low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
+        for place, pin in zip((0, -1), pins, strict=True):
+            if pin is not None:
+                low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
+        low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+        rows, signs, bounds = data.limits.sides
+        sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
+        sides /= units.of(data.limits)[rows]
+        side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
+        width = nlp.g.sizes["limits"] // n
+        rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
+        rows_low[:, side[signs > 0]] = sides[:, signs > 0]
+        rows_high[:, side[signs < 0]] = sides[:, signs < 0]
+        late = nlp.g.sizes["duration"]
+        equal = np.zeros(nlp.g["limits"].start)
+        longest = np.full(late, (tightening.duration or np.inf) / units.time)
+        rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
+        torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
+        most = most * data.torque_limit / torque
+        joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
+        within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+        motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
+        return {
+            "lbx": low[nlp.free],
+            "ubx": high[nlp.free],
+            "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+            "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
+        }
+
+    def _center(self) -> dict[str, Array]:
+        """Multipliers with which a motion is near the central path: none of the links b' = 2 a.
+
+        Empty where limits are soft.
+        """
+        nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
+        if nlp.objective is Objective.ELASTIC:
+            return {}
+        (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
+        slack = data.slack(data.nodes, profile, self.margin) / units.of(data.limits)[rows]
+        on_rows = np.zeros((len(slack), nlp.shape.rows))
+        for side, row in enumerate(rows.tolist()):
+            on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
+        on_x = np.zeros(nlp.free.shape)
+        on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
+        # The chain's multiplier at a node is the sum of those of normal forces from there on.
+        chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
+        multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
+        on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
+        return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows for this motion, on other elements, or tightened."""
-        task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
+        task, accuracy = self.task, self.task.options.accuracy
         # A first plan that misses much by signs of no row is a reference only; case: two releases
         # of a pentagon, whose plan takes 20 % longer.
-        slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
+        slack = self.data.slack(self.data.nodes, self.profile, self.margin)
         references = 6  # most
         if task.guides and self.meshes < references and (slack / self.data.spans).min() < -0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
@@ -456,26 +554,26 @@ class PathIterate:
         """Start on at least so many other elements, with these breaks, from this motion."""
         every, held = zip(self.task.curves, breaks, strict=True), self.task.is_held
         ends = [keep_apart(curve, places, held) for curve, places in every]
-        parts, old = self.task.lay_out(ends, elements), self.solution
+        parts = self.task.lay_out(ends, elements)
         grid = join(parts).grid
-        profile = Elements(self.data.grid, old.profile).move(grid)
+        profile = Elements(self.data.grid, self.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, parts, self.units, profile, old.margin)
+        made = PathIterate.on(self.task, parts, self.units, profile, self.margin)
         return replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
         data, tight = self.data, self.tightening
         short, over, _ = self.misses
-        solution, duration = self.solution, self.task.duration
+        duration = self.task.duration
         if duration is not None:
             # The quadrature of the NLP is not that of the motion.
-            off = solution.duration / sum(motion.duration for motion in self.motions)
+            off = self.duration / sum(motion.duration for motion in self.motions)
             duration *= float(np.clip(off, 0.8, 1.2))
         # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
         # Case: the largest margin of phase 3 of the heptagon on four contacts.
-        slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
+        slack, k = data.slack(data.nodes, self.profile, self.margin), data.grid.nonempty
         least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
         reach = np.where(short > 0, least, 0.0)
         added, less = (1.05 * data.spread_to_nodes(violation) for violation in (short, over))
@@ -486,8 +584,10 @@ class PathIterate:
     @cached_property
     def motions(self) -> list[PathMotion]:
         """The motion of each phase."""
-        pairs = zip(self.parts, cut(self.parts, self.solution.profile), strict=True)
-        return [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
+        ends = np.cumsum([len(part.grid.s) for part in self.parts])[:-1]
+        columns = zip(*(np.split(values, ends) for values in self.profile), strict=True)
+        pairs = zip(self.parts, columns, strict=True)
+        return [PathMotion(part.curve, part.grid, Profile(*each)) for part, each in pairs]
 
     @property
     def guides(self) -> tuple[Guide, ...]:
@@ -502,9 +602,9 @@ class PathIterate:
         duration, late = self.task.duration, 0.0
         if duration:
             late = sum(motion.duration for motion in self.motions) / duration - 1
-        data, profile = self.data, self.solution.profile
+        data, profile = self.data, self.profile
         over = np.zeros((len(data.grid.nonempty), 5))
-        short, over[:, 0] = data.misses(profile, self.solution.margin)
+        short, over[:, 0] = data.misses(profile, self.margin)
         if data.grid.held:
             torques, rates = find_torques(data, profile, self.motions)
             rate = np.abs(rates).max(axis=2) / data.rate_limit
@@ -542,15 +642,15 @@ class PathIterate:
         The sum of multipliers times the tightening of limits, (n, n_sides), and what is taken from
         `Tightening.shares`, (n, 5).
         """
-        nlp, data, units, solution = self.nlp, self.data, self.units, self.solution
+        nlp, data, units = self.nlp, self.data, self.units
         rows, signs, _ = data.limits.sides
-        on_g, count = solution.multipliers["lam_g0"], len(data.grid.s)
+        on_g, count = self.multipliers["lam_g0"], len(data.grid.s)
         on_limits = on_g[nlp.g["limits"]].reshape(count, -1)
         on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
         on_b = np.zeros(nlp.free.shape)
-        on_b[nlp.free] = solution.multipliers["lam_x0"]
+        on_b[nlp.free] = self.multipliers["lam_x0"]
         on_shares = np.zeros((count, 5))
-        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
+        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * self.profile.b / data.grid.sizes
         on_shares[:, 0] /= units.profile[0]
         for first, name, joints in (
             (1, "rates", nlp.shape.rates),
@@ -559,9 +659,9 @@ class PathIterate:
             on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
             on_shares[:, [first + joint for joint in joints]] = on_rows
         costs = (on_sides * limits).sum(axis=1) + (on_shares * shares).sum(axis=1)
-        scale = abs(solution.cost)
+        scale = abs(self.cost)
         if self.task.options.goal is Objective.MARGIN:
-            scale = abs(self.task.epsilon + solution.margin) / units.force
+            scale = abs(self.task.epsilon + self.margin) / units.force
         return np.asarray(costs / max(scale, 1e-9))
 
     @cached_property
@@ -573,7 +673,7 @@ class PathIterate:
             value = {
                 Objective.TIME: motion.duration,
                 Objective.EFFORT: squares + options.time_weight * motion.duration,
-                Objective.MARGIN: self.task.epsilon + self.solution.margin,
+                Objective.MARGIN: self.task.epsilon + self.margin,
             }[options.goal]
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
@@ -696,13 +796,6 @@ class Tightening(NamedTuple):
     # (N + 1, 5): factors on the largest b, both torque rate limits and both largest commands
     shares: Array
     duration: float | None  # [s]: longest duration, if there is one
-
-    @staticmethod
-    def none(data: PhaseData, duration: float | None) -> Tightening:
-        """Limits as they are."""
-        count = len(data.grid.s)
-        limits = np.zeros((count, len(data.spans)))
-        return Tightening(limits, limits, np.ones((count, 5)), duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -838,112 +931,6 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
 
 
-def parameters(nlp: PathNLP, data: PhaseData, units: Units, time_weight: float) -> Array:
-    """Parameters of the NLP, in its units."""
-    terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
-    torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
-    blocks = {
-        "steps": data.grid.steps / units.length,
-        "weight": np.array([time_weight / units.power]),
-        "calm": np.array([force / units.press]),
-        "a": terms[..., A] * a_unit / unit,
-        "b": terms[..., B] * b_unit / unit,
-        "lam": terms[..., LAMBDA] * force / unit,
-        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
-        "torque": data.nodes.forces.of_tau[..., ONE] / torque,
-        "joints": torque**2 / units.power,
-        "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
-        "lags": scene.actuator_lag[list(shape.commands)] / units.time,
-        "maps": data.grid.maps,
-        "sizes": data.grid.sizes,
-    }
-    return np.asarray(nlp.p.join(**{name: block.ravel("F") for name, block in blocks.items()}))
-
-
-def make_bounds(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    tightening: Tightening,
-    start: SureStart | None = None,
-    pins: tuple[float | None, float | None] = (None, None),
-) -> dict[str, Array]:
-    """Bounds of the NLP, with every limit tightened."""
-    share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
-    n, node = len(data.grid.s), nlp.node
-    low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
-    b_max = data.largest_b(data.nodes)
-    # Next to rest b is 2 s times the least s''.
-    s, length = data.grid.s, data.grid.s[-1]
-    low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-    high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
-    if data.grid.held:
-        low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
-    # From rest to rest, without reversal.
-    if nlp.shape.slow:
-        low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
-    else:
-        low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
-    if start is not None:
-        _, a_unit, force = units.profile
-        low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
-        low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
-    for place, pin in zip((0, -1), pins, strict=True):
-        if pin is not None:
-            low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
-    low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
-    rows, signs, bounds = data.limits.sides
-    sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
-    sides /= units.of(data.limits)[rows]
-    side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
-    width = nlp.g.sizes["limits"] // n
-    rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
-    rows_low[:, side[signs > 0]] = sides[:, signs > 0]
-    rows_high[:, side[signs < 0]] = sides[:, signs < 0]
-    late = nlp.g.sizes["duration"]
-    equal = np.zeros(nlp.g["limits"].start)
-    longest = np.full(late, (tightening.duration or np.inf) / units.time)
-    rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
-    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
-    most = most * data.torque_limit / torque
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
-    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
-    motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
-    return {
-        "lbx": low[nlp.free],
-        "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
-    }
-
-
-def pack(
-    nlp: PathNLP, profile: Profile, units: Units, extra: float | Array, sizes: Array | float = 1.0
-) -> Array:
-    """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
-
-    `extra` is the least margin [N], or shortfalls in the units of the limits.
-    """
-    table = np.empty(nlp.free.shape)
-    unit = units.force if nlp.objective is Objective.MARGIN else 1.0
-    table[:, nlp.node["extra"]] = extra / unit
-    table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
-    table[:, 0] /= sizes
-    return np.asarray(table[nlp.free])
-
-
-def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N], if any.
-
-    b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
-    """
-    table = np.zeros(nlp.free.shape)
-    table[nlp.free] = x
-    a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
-    return follow(grid, a, lam), margin
-
-
 # Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one
 # that is tried; case: joints with strong drag.
 _SLOW, _LEAST = -12, -32
@@ -970,11 +957,6 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     return _guess_at(data, 0.7 * fall * (shares[kept - 1] if kept else 1.0), time_weight)
 
 
-def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
-    """A slow guess, whatever the limits."""
-    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
-
-
 def _fall(data: PhaseData) -> float:
     """The b of a fall over the length of the curve [m^2/s^2]."""
     return float(2 * data.curve.formation.scene.scales.acceleration * data.grid.s[-1])
@@ -993,8 +975,9 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 def guess_below(data: PhaseData, fastest: Fastest) -> Profile:
     """A guess somewhat slower than the minimum-time profile."""
-    a, b = (_BELOW * np.interp(data.grid.s, *pair) for pair in (fastest.slopes, fastest[:2]))
-    return _complete(data, a, b)[0]
+    s, b, _ = fastest
+    a = np.interp(data.grid.s, (s[1:] + s[:-1]) / 2, np.diff(b) / (2 * np.diff(s)))
+    return _complete(data, _BELOW * a, _BELOW * np.interp(data.grid.s, s, b))[0]
 
 
 def _complete(data: PhaseData, a: Array, b: Array) -> tuple[Profile, Array]:
@@ -1019,21 +1002,3 @@ def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple
     power = time_weight + float(squares.sum(axis=1).mean())
     most = max(force, float(np.abs(whole).mean()))
     return profile, Units(length, 0.6 * duration, force, torque, power, most)
-
-
-def center(
-    nlp: PathNLP, data: PhaseData, units: Units, profile: Profile, margin: float
-) -> dict[str, Array]:
-    """Multipliers with which a motion is near the central path: none of the links b' = 2 a."""
-    (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
-    slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
-    on_rows = np.zeros((len(slack), nlp.shape.rows))
-    for side, row in enumerate(rows.tolist()):
-        on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
-    on_x = np.zeros(nlp.free.shape)
-    on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
-    # The chain's multiplier at a node is the sum of those of normal forces from there on.
-    chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
-    multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
-    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
-    return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}

@@ -45,11 +45,6 @@ class Guide(NamedTuple):
     b: Array
     lam: Array
 
-    def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """The motion at some places."""
-        a, b, lam = (np.interp(s, self.s, column) for column in self[1:])
-        return a, b, lam
-
 
 class RobustLimits(NamedTuple):
     """Robust force limits of a curve."""
@@ -160,7 +155,8 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     radii = np.array([widths[name] for name in names])
     bare = RobustLimits(tuple(names), radii, rows, s, segment, none)
     variations = bare.find_variations(formation, point, directions, forces, epsilon)
-    signs = _find_signs(bare, limits, forces, variations, point.z_s[:, 3:], guide.at(s))
+    a, b, lam = (np.interp(s, guide.s, column) for column in guide[1:])
+    signs = _find_signs(bare, limits, forces, variations, point.z_s[:, 3:], (a, b, lam))
     return bare._replace(signs=signs)
 
 
