@@ -25,7 +25,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, SolverError
 from wholearm.common.files import make_folder
 from wholearm.common.parallel import share
-from wholearm.common.signals import OutOfTime
+from wholearm.common.signals import OutOfTime, Reporter
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.closing import place as place_at
 from wholearm.geometry.curve import Curve
@@ -310,8 +310,9 @@ def test_edges_of_phases_without_a_plan_are_left_out_of_other_routes(
     failed.phases, plan = phases, Mock(return_value=failed)
     monkeypatch.setattr(astar, "plan_phases", plan)
     monkeypatch.setattr(astar.RoutePlanner, "_plan_parts", Mock(return_value=[]))
-    planner = astar.RoutePlanner(problem_of(HEPTAGON), None, own, OPTIONS, found=[route, route])
-    planner.plan(1, lambda _: None)
+    silent, problem = Reporter(None), problem_of(HEPTAGON)
+    planner = astar.RoutePlanner(problem, None, own, OPTIONS, silent, found=[route, route])
+    planner.plan()
     assert not planner.made and planner.failures == ["no plan"] * tries
     assert failed.edges == route.edges[lost] and plan.call_count == tries**2
 

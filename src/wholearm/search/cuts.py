@@ -18,7 +18,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import Change, InfeasibleError, InputError, Parameter, WholearmError
-from ..common.signals import OutOfTime
+from ..common.signals import OutOfTime, Reporter
 from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, describe
 from ..mechanics.limits import EPSILON, make_limits
@@ -27,7 +27,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Goal, Phase, Problem
 from ..scene.model import Scene
-from .astar import EAGER, NEARBY, Route, RoutePlanner, RouteSearch
+from .astar import EAGER, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
 from .edges import DEPENDENT, Blocked, Edge, describe_steps, edge_along, point_out
 from .places import make_place, require_reach
@@ -36,6 +36,7 @@ from .roadmap import Roadmap
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
 FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero
 TRIED = 3  # Most numbers with which the goal is looked for
+NEARBY = 30  # Most places that are looked at beyond borders that a number opens
 SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
 """Lengths of fingers and distances of their bases that are tried, relative to the problem's."""
@@ -189,14 +190,12 @@ def _search_changed(
     search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
-    planner = RoutePlanner(changed, None, search, rough, first_only=True)
+    planner = RoutePlanner(changed, None, search, rough, Reporter(None), first_only=True)
     try:
-        route = planner.find_first(lambda _: None, most)
-        if route is None:
-            return None
+        planner.look_by(EAGER._replace(most=most))
         if not planned:
-            return route, route.estimate
-        planner.plan(1, lambda _: None)
+            return (planner.found[0], planner.found[0].estimate) if planner.found else None
+        planner.plan()
     except np.linalg.LinAlgError:
         return None
     return (planner.made[0][1], planner.made[0][0].duration) if planner.made else None
