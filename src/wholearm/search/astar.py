@@ -162,9 +162,10 @@ class RouteSearch:
                     self.found.add(route.key)
                     yield route
                 continue
-            if route.edges and (chain := route.edges[-1].chain):
+            last = route.edges[-1] if route.edges else None
+            if last and last.chain and last.onwards:
                 before = Route(route.start, route.edges[:-1])
-                for edge in self.roadmap.go_on(chain, self.goal):
+                for edge in self.roadmap.go_on(last.chain, self.goal):
                     push(before.extend(edge))
             if times[place.key] >= (1 if place.landed else OFTEN):
                 continue

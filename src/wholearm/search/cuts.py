@@ -29,7 +29,7 @@ from ..problem.definition import Goal, Phase, Problem
 from ..scene.model import Scene
 from .astar import EAGER, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
-from .edges import DEPENDENT, Blocked, Edge, describe_steps, edge_along, point_out
+from .edges import DEPENDENT, Blocked, Chain, Edge, describe_steps, point_out
 from .places import make_place, require_reach
 from .roadmap import Roadmap
 
@@ -88,7 +88,7 @@ def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
     by_key: dict[str, tuple[Parameter, list[float]]] = {}
     for index, cut in enumerate(cuts):
-        formation, epsilon = cut.border.formation, cut.border.terms.epsilon
+        formation, epsilon = cut.border.formation, cut.border.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
             friction = number.key.startswith("friction")
             tried = number.value, 0.0 if friction else number.value * FARTHEST**number.sign
@@ -112,11 +112,10 @@ def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
     """The edge along a border of the changed problem, or why no motion follows it."""
     border, key = blocked.border, change.parameter.key
     if key == EPSILON:
-        border = replace(border, terms=border.terms._replace(epsilon=change.value))
+        border = replace(border, epsilon=change.value)
     else:
         border = replace(border, curve=change_curve(border.curve, key, change.value))
-    stop = replace(blocked.stop, scene=border.formation.scene)
-    return edge_along((border,), (1.0,), blocked.steps, stop)
+    return Chain((border,)).stop_at(blocked.steps[0].until)
 
 
 def find_opening(

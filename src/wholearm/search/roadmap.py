@@ -38,7 +38,6 @@ from .edges import (
     Chain,
     Edge,
     EdgeStep,
-    Terms,
     Unstopped,
     follow_borders,
     point_out,
@@ -126,7 +125,7 @@ class Roadmap:
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
         self.scene, self.epsilon = problem.scene, problem.epsilon
-        self.terms = Terms(problem.epsilon, uniqueness_margin)
+        self.uniqueness_margin = uniqueness_margin
         self.refined: set[Edge] = set()
         self._formations: dict[frozenset[Contact], Formation] = {}
         self.plans: dict[object, Plan | str] = {}
@@ -148,15 +147,14 @@ class Roadmap:
             if closed and (chain is None or chain.can_enter(formation)):
                 # The same contacts, in whatever order, are one formation, compiled once.
                 shared = self._formations.setdefault(frozenset(formation.contacts), formation)
-                make = partial(follow_borders, closed, shared, self.terms)
+                given = closed, shared, self.epsilon, self.uniqueness_margin
+                make = partial(follow_borders, *given)
                 borders += self._once(make, place.key, formation.contacts)
         return borders
 
     def follow(self, place: RoadmapPlace) -> list[Chain]:
         """Borders from a place."""
-        return self._once(
-            lambda: [Chain((), (border,), (1.0,)) for border in self.trace(place)], place.key
-        )
+        return self._once(lambda: [Chain((b,)) for b in self.trace(place)], place.key)
 
     def extend(self, chain: Chain) -> list[Chain]:
         """Chains with one more border entered in motion."""
@@ -193,7 +191,7 @@ class Roadmap:
             edge = waiting.pop()
             if isinstance(edge, Edge):
                 yield edge
-                if edge.chain:
+                if edge.chain and edge.onwards:
                     waiting += self.go_on(edge.chain, goal)
 
     def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
@@ -286,7 +284,7 @@ class Roadmap:
                 (z,) = place_at(scene, labels[:1], poses[inside][k : k + 1])
                 stop = RoadmapPlace(scene, z, formation.contacts, landed=True)
                 step = EdgeStep(formation.contacts, until)
-                edges.append(Edge(place, stop, (step,), float(times[k]), True))
+                edges.append(Edge(place, stop, (step,), float(times[k])))
         return edges
 
 
@@ -321,7 +319,7 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
         contacts, gained = tuple(table[c] for c in rays.labels[k]), table[rays.gained[k]]
         step, start = EdgeStep(contacts, Until(contact=gained)), places[rays.sources[k]]
         stop = RoadmapPlace(scene, end, (*contacts, gained), landed=True)
-        edges.append(Edge(start, stop, (step,), float(times[k]), True))
+        edges.append(Edge(start, stop, (step,), float(times[k])))
     return edges
 
 
