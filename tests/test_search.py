@@ -19,7 +19,7 @@ import wholearm
 from refused import advising
 from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved, table_of, text_of
-from wholearm import Formation, Goal, Phase, PlanOptions, Problem, load_plan, verify
+from wholearm import Formation, Goal, Phase, PlanOptions, Problem, Scene, load_plan, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, SolverError
@@ -360,12 +360,16 @@ def on_border(problem: Problem, phi: float) -> Array:
     return np.array(track.pose(track.places)).ravel()
 
 
+def split_leg(scene: Scene, start: Array, stop: Array) -> list[formation_list.Part]:
+    return formation_list.split_leg(scene, formation_list.choose_leg(scene, start, stop))
+
+
 @pytest.mark.parametrize("back", [False, True])
 def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back: bool) -> None:
     scene = heptagon.scene
     ends = [np.array([0.02, 0.3]), np.array([-0.08, -0.8])]
     start, stop = ends[::-1] if back else ends
-    parts = formation_list.split_leg(scene, start, stop)
+    parts = split_leg(scene, start, stop)
     assert len(parts) == 7
     np.testing.assert_array_equal(parts[0].start, start)
     np.testing.assert_allclose(parts[-1].stop, stop, atol=1e-12)
@@ -387,7 +391,7 @@ def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None
     near = formation_list.tolerance(heptagon.scene)
     for off in (0.0, 0.9, -0.9):
         ends = [on_border(heptagon, phi) + off * near for phi in (PHI, PHI + 0.15)]
-        (part,) = formation_list.split_leg(heptagon.scene, *ends)
+        (part,) = split_leg(heptagon.scene, *ends)
         assert len(part.contacts) == 4 and part.coordinate == 1
         for place, end in ((part.start, ends[0]), (part.stop, ends[1])):
             np.testing.assert_allclose(place, on_border(heptagon, place[1]), atol=1e-12)
@@ -414,7 +418,7 @@ def test_straight_leg_beside_a_curved_border(
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
     on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
     assert (np.diff(on_finger_2) != 0).sum() == 2
-    parts = formation_list.split_leg(scene, *leg)
+    parts = split_leg(scene, *leg)
     touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
     changes = sum(one != two for one, two in pairwise(touched))
     assert changes == (2 if crosses else 0)
@@ -425,21 +429,19 @@ def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
     phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
     words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
     with pytest.raises(InputError, match=words):
-        formation_list.split_leg(
-            heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1])
-        )
+        split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
 
 
 def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     scene, near = heptagon.scene, formation_list.tolerance(heptagon.scene)
     aside = np.array([near[0], 0.0])
     start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
-    text = formation_list.describe_miss(scene, start, stop)
+    text = formation_list.choose_leg(scene, start, stop).note
     words = "e6 flush on finger 2", " up to -", "mm in x", "0.5 deg"
     assert all(word in text for word in words)
-    assert formation_list.describe_miss(scene, start + 10 * aside, stop + 10 * aside) == ""
+    assert not formation_list.choose_leg(scene, start + 10 * aside, stop + 10 * aside).note
     phi = scene.polygon.flush_angle(0) + 3 * near[1]
-    palm = formation_list.describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    palm = formation_list.choose_leg(scene, np.array([0.045, phi]), np.array([0.0, phi])).note
     assert "e0 flush on the palm, is up to -1.5 deg" in palm
 
 

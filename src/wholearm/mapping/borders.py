@@ -68,7 +68,6 @@ class Track:
     # palm, finger 1 and finger 2; `NOWHERE` for a second one that is missing, or for no border
     label: Callable[[Array, Array, ClosedFinger], Numbers]
     places: Array  # (n,): parameters to sample at, increasing
-    step: float  # [m]: longest step in x between neighbouring points of what is drawn
     # the finger (None for the palm) and its flush edge; None where a contact changes its name
     flush: tuple[int | None, int] | None = None
 
@@ -128,7 +127,7 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
 
-    return Track(pose, label, places, LONGEST * scene.scales.length, (None, edge))
+    return Track(pose, label, places, (None, edge))
 
 
 def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array) -> Track:
@@ -157,7 +156,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         angle = np.arctan2(axis[:, 1], axis[:, 0])
         return _label_pair(closed, vertex, finger, angle, pair, within)
 
-    return Track(pose, label, places, LONGEST * scene.scales.length, (finger, edge))
+    return Track(pose, label, places, (finger, edge))
 
 
 def _circle_track(
@@ -214,7 +213,7 @@ def _circle_track(
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
         return _label_pair(closed, vertex, finger, angle, pair, supported)
 
-    return Track(pose, label, places, LONGEST * scene.scales.length)
+    return Track(pose, label, places)
 
 
 def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
@@ -294,7 +293,7 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
             start, held = after, following
         parts.append((start, float(places[rows][-1]), held))
         pieces += [
-            Piece(track, _fill(track, low, high), label)
+            Piece(track, _fill(track, low, high, LONGEST * scene.scales.length), label)
             for low, high, label in parts
             if label[0] != NOWHERE and high > low
         ]
@@ -340,11 +339,11 @@ def _find_changes(
     }
 
 
-def _fill(track: Track, low: float, high: float) -> Array:
-    """Places from `low` to `high`, close enough together to draw the curve."""
+def _fill(track: Track, low: float, high: float, step: float) -> Array:
+    """Places from `low` to `high`, with steps in x of `step` [m] at most, to draw the curve."""
     places = np.array([low, *track.places[(track.places > low) & (track.places < high)], high])
     for _ in range(8):
-        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > track.step)
+        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > step)
         if not len(wide):
             break
         places = np.sort(np.append(places, (places[wide] + places[wide + 1]) / 2))
