@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -540,43 +541,47 @@ def write_template(
 
 def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:
     """The file for one hand and a start, over the size."""
-    corners, scale, heavy = len(vertices), size / _SIZE, weight / _MASS
-    finger = {
-        "length": ((0.22 if few else 0.14) * scale, "m, joint to tip centre"),
-        "radius": (0.005 * scale, "m, half thickness of the link"),
-        "inertia": (0.005 * heavy * scale**2, "kg m^2, about the joint"),
-        "viscous": (0.01 * heavy * scale**1.5, "N m s, friction of the joint"),
-        "dry": (0.01 * heavy * scale, "N m, dry friction of the joint"),
-        "torque_limit": (2.0 * heavy * scale, "N m"),
-    }
-    lines = [
-        f"# A polygon with {corners} corners slides to the left on edge 0. Units: m, kg, s, rad.",
-        _row("name", f'"{name}"', ""),
-        _row("epsilon", _show(0.05 * heavy), "N, least normal force of every contact"),
-        _row("gravity", "9.81", "m/s^2"),
-        "\n[object]",
-        f"# corners, anticlockwise [m]; the inertia is that of uniform density\n"
-        f"vertices = [{', '.join(f'[{_show(x)}, {_show(y)}]' for x, y in vertices)}]",
-        _row("mass", _show(weight), "kg"),
-    ]
-    for number, side, word in ((1, 1.6, "right"), (2, -0.2 if few else -1.6, "left")):
-        base = f"[{_show(side * size)}, {_show(-0.2 * size)}]"
-        lines += [f"\n{f'[fingers.{number}]':<{_COMMENTS}}# {word}", _row("base", base, "m, joint")]
-        lines += [_row(key, _show(value), text) for key, (value, text) in finger.items()]
-    lines.append(f"\n{'[friction]':<{_COMMENTS}}# coefficient with the object")
-    lines += [_row(part, "0.05", "") for part in ("palm", "finger1", "finger2")]
-    lines += ["\n[start]", _row("flush", "0", "this edge lies on the palm")]
-    lines += [_row("x", _show(start * size), "m, centroid; both fingers close on the object")]
-    text = "\n".join(lines) + "\n"
+    scale, heavy = size / _SIZE, weight / _MASS
+    finger = f"""\
+length = {_show((0.22 if few else 0.14) * scale)} # m, joint to tip centre
+radius = {_show(0.005 * scale)} # m, half thickness of the link
+inertia = {_show(0.005 * heavy * scale**2)} # kg m^2, about the joint
+viscous = {_show(0.01 * heavy * scale**1.5)} # N m s, friction of the joint
+dry = {_show(0.01 * heavy * scale)} # N m, dry friction of the joint
+torque_limit = {_show(2.0 * heavy * scale)} # N m"""
+    text = f"""\
+# A polygon with {len(vertices)} corners slides to the left on edge 0. Units: m, kg, s, rad.
+name = "{name}"
+epsilon = {_show(0.05 * heavy)} # N, least normal force of every contact
+gravity = 9.81 # m/s^2
+
+[object]
+# corners, anticlockwise [m]; the inertia is that of uniform density
+vertices = [{", ".join(f"[{_show(x)}, {_show(y)}]" for x, y in vertices)}]
+mass = {_show(weight)} # kg
+
+[fingers.1] # right
+base = [{_show(1.6 * size)}, {_show(-0.2 * size)}] # m, joint
+{finger}
+
+[fingers.2] # left
+base = [{_show((-0.2 if few else -1.6) * size)}, {_show(-0.2 * size)}] # m, joint
+{finger}
+
+[friction] # coefficient with the object
+palm = 0.05
+finger1 = 0.05
+finger2 = 0.05
+
+[start]
+flush = 0 # this edge lies on the palm
+x = {_show(start * size)} # m, centroid; both fingers close on the object
+"""
+    text = re.sub('^([^"\n]+) # ', lambda row: f"{row[1]:<{_COMMENTS}}# ", text, flags=re.MULTILINE)
     problem = build_problem(tomllib.loads(text))
     x, _, phi = (float(value) for value in problem.start[:3])
     route = list_formations(problem, (x, phi), ((start - 0.4) * size, phi))
     return text + "\n" + format_route(route)
-
-
-def _row(key: str, value: str, comment: str) -> str:
-    text = f"{key} = {value}"
-    return f"{text:<{_COMMENTS}}# {comment}" if comment else text
 
 
 def _show(value: float) -> str:
