@@ -44,11 +44,9 @@ def load(path: str) -> Problem:
 
 def check_phases(problem: Problem) -> None:
     """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
-    curves = trace_phases(problem)
-    if len(curves) == len(problem.phases):
-        return
     from .path_guess import find_end
 
+    curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     with name_source(problem.source):
         for phase in problem.phases[len(curves) :]:

@@ -142,7 +142,13 @@ def build_map(
     inside = label_inside(scene, closed)
     free = inside[:, 0] != NOWHERE
     places, inside, z = places[free], inside[free], closed.z[free]
-    directions = _check_cells(problem, inside[:, [0, 2, 4]], z, limit)
+    labels, pose = inside[:, [0, 2, 4]], np.broadcast_to(np.eye(5)[[0, 2]], (len(z), 2, 5))
+    kinematics = evaluate_each(scene, labels, z)
+    matrix = np.concatenate([kinematics.A, pose], axis=1)
+    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
+    tangents = np.zeros((len(z), len(WAYS), 5))
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
+    directions = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
     return FormationMap(problem, x, phi, *parts, places, *directions)
@@ -212,20 +218,6 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
             edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))
             crossings.append(Crossing(points[k], z, contacts, edges))
     return tuple(crossings)
-
-
-def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> tuple[Flags, Flags]:
-    """Whether motions inside cells are feasible in the directions `WAYS`, (n, 4).
-
-    And where contact forces of one that would be are not unique, (n,).
-    """
-    scene, pose = problem.scene, np.broadcast_to(np.eye(5)[[0, 2]], (len(z), 2, 5))
-    kinematics = evaluate_each(scene, labels, z)
-    matrix = np.concatenate([kinematics.A, pose], axis=1)
-    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
-    tangents = np.zeros((len(z), len(WAYS), 5))
-    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
-    return _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
 
 
 def _check_motions(

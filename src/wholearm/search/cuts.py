@@ -58,11 +58,6 @@ class Opening(NamedTuple):
         values = [value for value in chosen if not math.isnan(value)]
         return Change(self.parameter, max(values) if self.parameter.sign > 0 else min(values))
 
-    def list_open(self, change: Change) -> list[int]:
-        """Numbers of the borders that a change opens."""
-        sign = self.parameter.sign
-        return [k for k, value in enumerate(self.values) if sign * (change.value - value) >= 0]
-
 
 def list_cut(search: RouteSearch) -> list[Blocked]:
     """Blocked borders out of the reached places, the nearest to the goal first.
@@ -134,16 +129,16 @@ def find_opening(
     report("looking for a number that opens the way")
     cuts, tried = list_cut(search)[:CUT], list[str]()
 
-    def find(
-        change: Change, beyond: Sequence[int], planned: bool
-    ) -> tuple[float, Sequence[int]] | None:
-        """About how long a route beyond some borders takes [s], and which of them it crosses."""
+    def find(opening: Opening, change: Change, planned: bool) -> tuple[float, Sequence[int]] | None:
+        """About how long a route beyond opened borders takes [s], and which of them it crosses."""
         try:
             changed = problem.with_(change.values)
         except InputError:
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
-        for k in beyond:
+        for k, value in enumerate(opening.values):
+            if not opening.parameter.sign * (change.value - value) >= 0:
+                continue
             before = search.reached.get(cuts[k].start.key)
             edge = edge_changed(cuts[k], change)
             if before is not None and isinstance(edge, Edge):
@@ -156,11 +151,11 @@ def find_opening(
 
     for opening in list_openings(cuts)[:TRIED]:
         most = opening.open_all()
-        route = find(most, opening.list_open(most), False)
+        route = find(opening, most, False)
         # Borders beyond those that the route crosses may need the larger change.
         least = most if route is None else opening.open_all(route[1])
         for change in dict.fromkeys((least, most)) if route else ():
-            reached = find(change, opening.list_open(change), True)
+            reached = find(opening, change, True)
             if reached is not None:
                 return _describe_reached(change, reached[0]), (change,)
         tried.append(str(most))

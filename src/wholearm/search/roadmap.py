@@ -131,7 +131,6 @@ class Roadmap:
         self.plans: dict[object, Plan | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
         self.part_plans: dict[object, PartPlan | Lost] = {}
-        self._releases: dict[BorderEdge, list[Edge]] = {}
         self._known: dict[tuple[object, ...], Any] = {}
 
     def _once(self, make: Callable[[], T], *key: object) -> T:
@@ -156,16 +155,6 @@ class Roadmap:
         """Borders from a place."""
         return self._once(lambda: [Chain((b,)) for b in self.trace(place)], place.key)
 
-    def extend(self, chain: Chain) -> list[Chain]:
-        """Chains with one more border entered in motion."""
-        last = chain.borders[-1]
-        if last.gained is None or len(chain.borders) == LONGEST:
-            return []
-        chains = self._once(
-            lambda: [chain.extend(border) for border in self.trace(last.stop, chain)], chain.borders
-        )
-        return [longer for longer in chains if longer]
-
     def set_out(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge | Blocked]:
         """Edges along borders from a place, along several only where a motion cannot stop."""
         for chain in self.follow(place):
@@ -173,7 +162,13 @@ class Roadmap:
 
     def go_on(self, chain: Chain, goal: Goal) -> Iterator[Edge]:
         """Feasible edges that pass the end of a chain in motion; further ones as in `set_out`."""
-        for longer in self.extend(chain):
+        last = chain.borders[-1]
+        if last.gained is None or len(chain.borders) == LONGEST:
+            return
+        chains = self._once(
+            lambda: [chain.extend(border) for border in self.trace(last.stop, chain)], chain.borders
+        )
+        for longer in filter(None, chains):
             yield from (e for e in self._list_ends(longer, goal) if isinstance(e, Edge))
 
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Edge | Blocked]:
@@ -205,9 +200,7 @@ class Roadmap:
 
         Those of all borders `among` are computed together, which takes less time.
         """
-        if border in self._releases:
-            return self._releases[border]
-        borders = [other for other in among if other not in self._releases]
+        borders = [each for each in among if ("release", each) not in self._known]
         sources = dict[RoadmapPlace, tuple[BorderEdge, float, float]]()
         for each in borders:
             times = time_parts(each, RELEASES)
@@ -227,8 +220,9 @@ class Roadmap:
                 whole = replace(edge, start=left.start, steps=steps, estimate=duration)
                 best[key] = replace(whole, left=left.curve, share=share)
         for each in borders:
-            self._releases[each] = [edge for (left, _), edge in best.items() if left is each]
-        return self._releases[border]
+            edges = [edge for (left, _), edge in best.items() if left is each]
+            self._known["release", each] = edges
+        return cast(list[Edge], self._known["release", border])
 
     def land_at(self, edges: Sequence[Edge], goal: Goal) -> list[Edge]:
         """Copies of edges that land on the edge of a goal with x, moved to land at this x.
