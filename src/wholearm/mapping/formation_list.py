@@ -331,12 +331,7 @@ def split_leg(scene: Scene, leg: Leg) -> list[Part]:
         spans[-1] = (label, first, leg.stop)
     if leg.track.flush is None:
         spans = _drop_excursions(scene, leg, spans)
-    return _build_parts(scene, leg, spans, at_change)
-
-
-def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> list[Part]:
-    table, near = contact_table(scene), tolerance(scene)
-    parts = []
+    table, parts = contact_table(scene), list[Part]()
     for index, (label, first, last) in enumerate(spans):
         mine = name_contacts(table, label)
         begin, end = leg.at(first), leg.at(last)
@@ -354,7 +349,7 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             gained = tuple(c for c in touching if c not in mine)
             if not gained:
                 end = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
-        coordinate = int((np.abs(end - begin) / near).argmax())
+        coordinate = int((np.abs(end - begin) / tolerance(scene)).argmax())
         if leg.track.flush is not None:
             coordinate = 0 if leg.on_palm else 1
         parts.append(Part(mine, begin, end, gained, coordinate))

@@ -197,10 +197,9 @@ class Goal:
     x: float | None = None
 
     def __str__(self) -> str:
+        text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
         if self.flush is not None:
             text = f"edge {self.flush} on the palm"
-        else:
-            text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
         return text if self.x is None else f"{text} at x = {self.x:g} m"
 
     def find_angle(self, scene: Scene, near: float) -> float:

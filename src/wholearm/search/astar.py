@@ -453,7 +453,7 @@ class RoutePlanner:
         self._measurements += len(new)
         if new:
             self.report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
-        plan = partial(plan_coarsely, self.free, options=self.options, further=True)
+        plan = partial(plan_coarsely, self.free, options=self.options)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
         for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
