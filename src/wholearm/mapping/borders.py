@@ -278,40 +278,16 @@ def _label(
 def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
     """Cut tracks into pieces with one label each, by multisection; only those in the window."""
     label_places = partial(_label, scene, tracks, window)
-    sizes = [len(track.places) for track in tracks]
-    owners = np.repeat(np.arange(len(tracks)), sizes)
+    owners = np.repeat(np.arange(len(tracks)), [len(track.places) for track in tracks])
     places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
     labels = label_places(owners, places)
-    changes = _find_changes(label_places, owners, places, labels)
-    pieces, first = [], 0
-    for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
-        rows, first = slice(first, first + size), first + size
-        start, held = float(places[rows][0]), labels[rows][0]
-        parts = []
-        for before, after, following in changes.get(index, ()):
-            parts.append((start, before, held))
-            start, held = after, following
-        parts.append((start, float(places[rows][-1]), held))
-        pieces += [
-            Piece(track, _fill(track, low, high, LONGEST * scene.scales.length), label)
-            for low, high, label in parts
-            if label[0] != NOWHERE and high > low
-        ]
-    return pieces
-
-
-def _find_changes(
-    label_places: Callable[[Numbers, Array], Numbers],
-    owners: Numbers,
-    places: Array,
-    labels: Numbers,
-) -> dict[int, list[tuple[float, float, Numbers]]]:
-    """Changes of labels by track: last place with the old one, first with the new, and the new."""
-    within = owners[1:] == owners[:-1]
-    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
+    leads, trails = np.diff(owners, prepend=-1) > 0, np.diff(owners, append=len(tracks)) > 0
+    # Where pieces begin and end: at the ends of tracks, and on both sides of changes of labels.
+    starts = [(owners[leads], places[leads], labels[leads])]
+    stops = [(owners[trails], places[trails])]
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & ~leads[1:])
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
-    track_changes: dict[int, list[tuple[float, float, Numbers]]] = {}
     # Eight changes between two neighbouring places at most.
     for _ in range(8):
         if not len(low):
@@ -326,17 +302,21 @@ def _find_changes(
             rows = np.arange(len(ends))
             low, high = ends[rows, first], ends[rows, first + 1]
         new = label_places(owner, high)
-        for k, before, after, label in zip(
-            owner.tolist(), low.tolist(), high.tolist(), new, strict=True
-        ):
-            track_changes.setdefault(k, []).append((before, after, label))
+        starts.append((owner, high, new))
+        stops.append((owner, low))
         # A second change may hide behind the first.
         more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
-    return {
-        k: sorted(changes, key=lambda change: change[0]) for k, changes in track_changes.items()
-    }
+    begun, start, held = (np.concatenate(column) for column in zip(*starts, strict=True))
+    ended, stop = (np.concatenate(column) for column in zip(*stops, strict=True))
+    order, step = np.lexsort((start, begun)), LONGEST * scene.scales.length
+    ends = np.column_stack([start[order], stop[np.lexsort((stop, ended))]])
+    return [
+        Piece(tracks[k], _fill(tracks[k], low, high, step), label)
+        for k, (low, high), label in zip(begun[order], ends.tolist(), held[order], strict=True)
+        if label[0] != NOWHERE and high > low
+    ]
 
 
 def _fill(track: Track, low: float, high: float, step: float) -> Array:
