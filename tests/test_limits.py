@@ -41,7 +41,7 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.make import make_rows
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.scene.model import Friction
-from wholearm.search.edges import BorderEdge, Terms, estimate_duration, time_parts
+from wholearm.search.edges import BorderEdge, estimate_duration, time_parts
 from wholearm.search.places import make_place
 from wholearm.search.roadmap import time_paths
 
@@ -237,10 +237,13 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     path = labels, pose + np.array([-0.008, 0.1]), pose + np.array([0.015, 0.23])
 
     def measure(epsilon: float) -> Array:
-        border = BorderEdge(place, curve, Terms(EPSILON, 0.0))
+        border = BorderEdge(place, curve, EPSILON, 0.0)
         least = bound_least_time([curve], EPSILON)
         assert least is not None
-        of_border = estimate_duration([border.limits]), time_parts(border, np.array([1.0]))[0]
+        of_border = (
+            estimate_duration([border.limits], [1.0]),
+            time_parts(border, np.array([1.0]))[0],
+        )
         of_cell = time_paths(formation.scene, epsilon, *path)[0]
         return np.array([least.value, look_along([curve], EPSILON, 50), *of_border, of_cell])
 

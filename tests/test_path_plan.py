@@ -39,8 +39,9 @@ from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import LimitShape, PathNLP, Task, plan_curves
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
+from wholearm.problem.definition import Until
 from wholearm.results.trajectory import Samples
-from wholearm.search.edges import BorderEdge, Edge, Terms, edge_along
+from wholearm.search.edges import BorderEdge, Chain, Edge
 from wholearm.search.places import make_place
 
 EPSILON = 0.05
@@ -544,8 +545,7 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     # Nor does the search for routes give up the border on which it lies.
     slow = curves[1]
     place = make_place(slow.formation.scene, slow.start)
-    border = BorderEdge(place, slow, Terms(epsilon, 0.1))
-    edge = edge_along((border,), (1.0,), (), border.stop)
+    edge = Chain((BorderEdge(place, slow, epsilon, 0.1),)).stop_at(Until())
     # A crawl through that place on the first grid is a tenth too slow; 1 would be no estimate.
     assert isinstance(edge, Edge) and edge.estimate == pytest.approx(
         look_along([slow], epsilon, 1000), rel=0.2

@@ -19,13 +19,13 @@ import wholearm
 from refused import advising
 from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved, table_of, text_of
-from wholearm import Formation, Goal, Phase, PlanOptions, Problem, load_plan, verify
+from wholearm import Formation, Goal, Phase, PlanOptions, Problem, Scene, load_plan, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, SolverError
 from wholearm.common.files import make_folder
 from wholearm.common.parallel import share
-from wholearm.common.signals import OutOfTime
+from wholearm.common.signals import OutOfTime, Reporter
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.closing import place as place_at
 from wholearm.geometry.curve import Curve
@@ -91,9 +91,7 @@ def test_no_route_along_borders_is_faster() -> None:
     bound = bound_borders(own, 1.0)
     least = sum(edge.fine_bound for edge in route.edges)
     assert bound.complete and 0.99 * route.estimate < bound.value <= least * (1 + 1e-9)
-    assert bound_borders(own, 0.05).value == 0.05
-    # A bound up to more says what one up to less does.
-    assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
+    assert bound_borders(own, 0.05) == (0.05, True)
 
 
 def test_under_rate_limits_motions_begin_on_borders_where_torques_hold() -> None:
@@ -310,8 +308,9 @@ def test_edges_of_phases_without_a_plan_are_left_out_of_other_routes(
     failed.phases, plan = phases, Mock(return_value=failed)
     monkeypatch.setattr(astar, "plan_phases", plan)
     monkeypatch.setattr(astar.RoutePlanner, "_plan_parts", Mock(return_value=[]))
-    planner = astar.RoutePlanner(problem_of(HEPTAGON), None, own, OPTIONS, found=[route, route])
-    planner.plan(1, lambda _: None)
+    silent, problem = Reporter(None), problem_of(HEPTAGON)
+    planner = astar.RoutePlanner(problem, None, own, OPTIONS, silent, found=[route, route])
+    planner.plan()
     assert not planner.made and planner.failures == ["no plan"] * tries
     assert failed.edges == route.edges[lost] and plan.call_count == tries**2
 
@@ -359,12 +358,16 @@ def on_border(problem: Problem, phi: float) -> Array:
     return np.array(track.pose(track.places)).ravel()
 
 
+def split_leg(scene: Scene, start: Array, stop: Array) -> list[formation_list.Part]:
+    return formation_list.split_leg(scene, formation_list.choose_leg(scene, start, stop))
+
+
 @pytest.mark.parametrize("back", [False, True])
 def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back: bool) -> None:
     scene = heptagon.scene
     ends = [np.array([0.02, 0.3]), np.array([-0.08, -0.8])]
     start, stop = ends[::-1] if back else ends
-    parts = formation_list.split_leg(scene, start, stop)
+    parts = split_leg(scene, start, stop)
     assert len(parts) == 7
     np.testing.assert_array_equal(parts[0].start, start)
     np.testing.assert_allclose(parts[-1].stop, stop, atol=1e-12)
@@ -386,7 +389,7 @@ def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None
     near = formation_list.tolerance(heptagon.scene)
     for off in (0.0, 0.9, -0.9):
         ends = [on_border(heptagon, phi) + off * near for phi in (PHI, PHI + 0.15)]
-        (part,) = formation_list.split_leg(heptagon.scene, *ends)
+        (part,) = split_leg(heptagon.scene, *ends)
         assert len(part.contacts) == 4 and part.coordinate == 1
         for place, end in ((part.start, ends[0]), (part.stop, ends[1])):
             np.testing.assert_allclose(place, on_border(heptagon, place[1]), atol=1e-12)
@@ -413,7 +416,7 @@ def test_straight_leg_beside_a_curved_border(
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
     on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
     assert (np.diff(on_finger_2) != 0).sum() == 2
-    parts = formation_list.split_leg(scene, *leg)
+    parts = split_leg(scene, *leg)
     touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
     changes = sum(one != two for one, two in pairwise(touched))
     assert changes == (2 if crosses else 0)
@@ -424,21 +427,19 @@ def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
     phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
     words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
     with pytest.raises(InputError, match=words):
-        formation_list.split_leg(
-            heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1])
-        )
+        split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
 
 
 def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     scene, near = heptagon.scene, formation_list.tolerance(heptagon.scene)
     aside = np.array([near[0], 0.0])
     start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
-    text = formation_list.describe_miss(scene, start, stop)
+    text = formation_list.choose_leg(scene, start, stop).note
     words = "e6 flush on finger 2", " up to -", "mm in x", "0.5 deg"
     assert all(word in text for word in words)
-    assert formation_list.describe_miss(scene, start + 10 * aside, stop + 10 * aside) == ""
+    assert not formation_list.choose_leg(scene, start + 10 * aside, stop + 10 * aside).note
     phi = scene.polygon.flush_angle(0) + 3 * near[1]
-    palm = formation_list.describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    palm = formation_list.choose_leg(scene, np.array([0.045, phi]), np.array([0.0, phi])).note
     assert "e0 flush on the palm, is up to -1.5 deg" in palm
 
 

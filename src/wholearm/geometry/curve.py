@@ -108,12 +108,7 @@ class Curve:
             return self
         share = self.speed_ratio / ratio
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        curve = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
-        if "segments" in self.__dict__:
-            # Reversals are where they were.
-            ends = ((part, share * part.start, share * part.stop) for part in self.segments)
-            curve.__dict__["segments"] = tuple(replace(p, start=a, stop=b) for p, a, b in ends)
-        return curve
+        return replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
 
     @property
     def start(self) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -44,11 +44,9 @@ def load(path: str) -> Problem:
 
 def check_phases(problem: Problem) -> None:
     """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
-    curves = trace_phases(problem)
-    if len(curves) == len(problem.phases):
-        return
     from .path_guess import find_end
 
+    curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     with name_source(problem.source):
         for phase in problem.phases[len(curves) :]:
@@ -272,15 +270,15 @@ def find_crossing(
         return None
     row = int(broken.any(axis=1).argmax())
     roots = {}
+
+    def margin(k: int, s: float) -> float:
+        return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
+
     for k in np.flatnonzero(broken[row]):
         if row == 0 or values[row - 1, k] <= 10 * ROUNDING:
             roots[int(k)] = float(grid[max(row - 1, 0)])
         else:
-
-            def margin(s: float, k: int = int(k)) -> float:
-                return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
-
-            roots[int(k)] = find_root(margin, grid[row - 1], grid[row])
+            roots[int(k)] = find_root(partial(margin, int(k)), grid[row - 1], grid[row])
     first = min(roots.values())
     closed = np.abs(margins(panel.interpolate(np.array([first]))[0])[0]) < TOUCHING
     active = {*np.flatnonzero(closed).tolist(), *(k for k in roots if roots[k] == first)}

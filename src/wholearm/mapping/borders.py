@@ -68,7 +68,6 @@ class Track:
     # palm, finger 1 and finger 2; `NOWHERE` for a second one that is missing, or for no border
     label: Callable[[Array, Array, ClosedFinger], Numbers]
     places: Array  # (n,): parameters to sample at, increasing
-    step: float  # [m]: longest step in x between neighbouring points of what is drawn
     # the finger (None for the palm) and its flush edge; None where a contact changes its name
     flush: tuple[int | None, int] | None = None
 
@@ -128,7 +127,7 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
 
-    return Track(pose, label, places, LONGEST * scene.scales.length, (None, edge))
+    return Track(pose, label, places, (None, edge))
 
 
 def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array) -> Track:
@@ -157,7 +156,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         angle = np.arctan2(axis[:, 1], axis[:, 0])
         return _label_pair(closed, vertex, finger, angle, pair, within)
 
-    return Track(pose, label, places, LONGEST * scene.scales.length, (finger, edge))
+    return Track(pose, label, places, (finger, edge))
 
 
 def _circle_track(
@@ -214,7 +213,7 @@ def _circle_track(
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
         return _label_pair(closed, vertex, finger, angle, pair, supported)
 
-    return Track(pose, label, places, LONGEST * scene.scales.length)
+    return Track(pose, label, places)
 
 
 def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
@@ -279,40 +278,16 @@ def _label(
 def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
     """Cut tracks into pieces with one label each, by multisection; only those in the window."""
     label_places = partial(_label, scene, tracks, window)
-    sizes = [len(track.places) for track in tracks]
-    owners = np.repeat(np.arange(len(tracks)), sizes)
+    owners = np.repeat(np.arange(len(tracks)), [len(track.places) for track in tracks])
     places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
     labels = label_places(owners, places)
-    changes = _find_changes(label_places, owners, places, labels)
-    pieces, first = [], 0
-    for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
-        rows, first = slice(first, first + size), first + size
-        start, held = float(places[rows][0]), labels[rows][0]
-        parts = []
-        for before, after, following in changes.get(index, ()):
-            parts.append((start, before, held))
-            start, held = after, following
-        parts.append((start, float(places[rows][-1]), held))
-        pieces += [
-            Piece(track, _fill(track, low, high), label)
-            for low, high, label in parts
-            if label[0] != NOWHERE and high > low
-        ]
-    return pieces
-
-
-def _find_changes(
-    label_places: Callable[[Numbers, Array], Numbers],
-    owners: Numbers,
-    places: Array,
-    labels: Numbers,
-) -> dict[int, list[tuple[float, float, Numbers]]]:
-    """Changes of labels by track: last place with the old one, first with the new, and the new."""
-    within = owners[1:] == owners[:-1]
-    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
+    leads, trails = np.diff(owners, prepend=-1) > 0, np.diff(owners, append=len(tracks)) > 0
+    # Where pieces begin and end: at the ends of tracks, and on both sides of changes of labels.
+    starts = [(owners[leads], places[leads], labels[leads])]
+    stops = [(owners[trails], places[trails])]
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & ~leads[1:])
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
-    track_changes: dict[int, list[tuple[float, float, Numbers]]] = {}
     # Eight changes between two neighbouring places at most.
     for _ in range(8):
         if not len(low):
@@ -327,24 +302,28 @@ def _find_changes(
             rows = np.arange(len(ends))
             low, high = ends[rows, first], ends[rows, first + 1]
         new = label_places(owner, high)
-        for k, before, after, label in zip(
-            owner.tolist(), low.tolist(), high.tolist(), new, strict=True
-        ):
-            track_changes.setdefault(k, []).append((before, after, label))
+        starts.append((owner, high, new))
+        stops.append((owner, low))
         # A second change may hide behind the first.
         more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
-    return {
-        k: sorted(changes, key=lambda change: change[0]) for k, changes in track_changes.items()
-    }
+    begun, start, held = (np.concatenate(column) for column in zip(*starts, strict=True))
+    ended, stop = (np.concatenate(column) for column in zip(*stops, strict=True))
+    order, step = np.lexsort((start, begun)), LONGEST * scene.scales.length
+    ends = np.column_stack([start[order], stop[np.lexsort((stop, ended))]])
+    return [
+        Piece(tracks[k], _fill(tracks[k], low, high, step), label)
+        for k, (low, high), label in zip(begun[order], ends.tolist(), held[order], strict=True)
+        if label[0] != NOWHERE and high > low
+    ]
 
 
-def _fill(track: Track, low: float, high: float) -> Array:
-    """Places from `low` to `high`, close enough together to draw the curve."""
+def _fill(track: Track, low: float, high: float, step: float) -> Array:
+    """Places from `low` to `high`, with steps in x of `step` [m] at most, to draw the curve."""
     places = np.array([low, *track.places[(track.places > low) & (track.places < high)], high])
     for _ in range(8):
-        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > track.step)
+        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > step)
         if not len(wide):
             break
         places = np.sort(np.append(places, (places[wide] + places[wide + 1]) / 2))

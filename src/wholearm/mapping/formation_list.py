@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -26,7 +27,7 @@ from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
 from ..scene.model import PLACE, TURN, Polygon, Scene
-from .borders import Track, Window, cut, flush_track, label_inside, name_contacts, palm_track
+from .borders import Piece, Track, Window, cut, flush_track, label_inside, name_contacts, palm_track
 
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
 _COMMENTS = 31  # Column of the comments
@@ -36,7 +37,7 @@ PLACES = 401  # samples of a leg
 INSIDE = 0.2  # distance of a leg's end from an obstacle, over `NEAR`
 DIGITS = 1e-5  # rounding of the coordinates that end phases, in radii of gyration and rad
 Span = tuple[Numbers, float, float]  # a label, and the parameters between which a leg has it
-Step = tuple[tuple[Contact, ...], Until]  # contacts of a phase, and its end
+Walked = tuple["Stretch", Array]  # a phase, and the configuration at its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,20 +89,21 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     z, start, corners, notes = _begin(problem, corners)
     origin, stretches = z[[0, 2]], list[Stretch]()
     for leg, there in enumerate(corners, start=1):
-        here = z[[0, 2]]
-        note = describe_miss(problem.scene, here, there)
+        path = choose_leg(problem.scene, z[[0, 2]], there)
         try:
-            walked = walk_leg(problem, len(stretches), z, here, there)
+            walked = walk_leg(problem, len(stretches), z, path)
         except InputError as error:
-            text = f"leg {leg} {error.problem}" + (f"; {note}" if note else "")
+            text = f"leg {leg} {error.problem}" + (f"; {path.note}" if path.note else "")
             raise InputError("", "route", text) from None
-        if note:
-            notes.append(f"leg {leg} goes through cells: {note}")
-        for k, ((contacts, until), end) in enumerate(walked):
-            stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
-            before = stretches[-1] if stretches and k == 0 else None
+        if path.note:
+            notes.append(f"leg {leg} goes through cells: {path.note}")
+        for k, (stretch, end) in enumerate(walked):
+            contacts, before = (
+                set(stretch.contacts),
+                stretches[-1] if stretches and k == 0 else None,
+            )
             # On a border a leg may continue the one before; a reversal is a new phase.
-            if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
+            if before is not None and len(contacts) == 4 and set(before.contacts) == contacts:
                 runs = (before.stop - before.start) * (stretch.stop - stretch.start)
                 onwards = (runs / [problem.scene.scales.length**2, 1]).sum() > 0
                 if onwards and before.until.contact is None:
@@ -184,23 +186,14 @@ class Part(NamedTuple):
     coordinate: int  # {0, 1}: x or phi, whichever changes more
 
 
-Walked = tuple[Step, Array]  # a phase, and the configuration at its end
-
-
-def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:
-    """Phases along a leg, with their final configurations; an `InputError` if there are none.
+def walk_leg(problem: Problem, index: int, z: Array, leg: Leg) -> list[Walked]:
+    """Phases along a leg from z, (5,), with their ends; an `InputError` if there are none.
 
     A phase with two degrees of freedom ends at the nearest place, not on the leg, except for the
-    last one.
-
-    Parameters
-    ----------
-    index                        number of the first phase, from 0
-    z : (5,)                     configuration at the start
-    start, stop : (2,) [m, rad]  x and phi at the ends of the leg
+    last one. Phases are counted from `index`.
     """
     walked: list[Walked] = []
-    parts, near = split_leg(problem.scene, start, stop), tolerance(problem.scene)
+    parts, near = split_leg(problem.scene, leg), tolerance(problem.scene)
     while parts:
         while len(parts) > 1 and (np.abs(parts[0].stop - parts[0].start) < near).all():
             # A first part within `NEAR` is left out if the next one can start here.
@@ -232,7 +225,8 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
                 if moved < (STILL * scene.scales.length) ** 2:
                     text = f"{until} holds already at {describe_pose(start)}"
                     raise InputError("", "", text)
-                walked.append(((contacts, until), end))
+                stretch = Stretch(contacts, until, start[[0, 2]], end[[0, 2]])
+                walked.append((stretch, end))
         except InputError as error:
             first = first or error
             continue
@@ -255,14 +249,16 @@ def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
     return not _list_missing(scene, z, contacts) and is_inside(Formation(scene, contacts), z)
 
 
-def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
-    """Candidate phases for a part from `z`, the simplest first."""
+def _list_steps(
+    scene: Scene, z: Array, part: Part, last: bool
+) -> Iterator[list[tuple[tuple[Contact, ...], Until]]]:
+    """Contacts and ends of candidate phases for a part from `z`, the simplest first."""
     gains = [[(part.contacts, Until(contact=c))] for c in part.gained]
     simple = gains or [[(part.contacts, end_at(scene, part.coordinate, part.stop))]]
     if last and len(part.contacts) == 3:
         # One phase with terminal constraints on the pose.
         pose = [end_at(scene, row, part.stop) for row in (0, 1)]
-        pins = [((end.coordinate, end.value or 0.0),) for end in pose]
+        pins = [end.coordinates for end in pose]
         for contact, pin in product(part.gained, pins):
             yield [(part.contacts, Until(contact=contact, pins=pin))]
         if not part.gained:
@@ -294,16 +290,14 @@ def end_at(scene: Scene, row: int, pose: Array) -> Until:
     return Until(coordinate="phi", value=math.radians(degrees))
 
 
-def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
+def split_leg(scene: Scene, leg: Leg) -> list[Part]:
     """Split a leg into parts with one formation each.
 
-    A leg with both ends within `NEAR` of one border follows the border; any other is straight.
     An end that near a change of contacts is moved to it, and a straight leg that leaves a cell by
     no more than that, and comes back, stays in it.
 
     InputError if part of the leg cannot be reached, or it runs through a crossing of borders.
     """
-    leg = choose_leg(scene, start, stop)
     low, high = min(leg.start, leg.stop), max(leg.start, leg.stop)
     near = min(leg.near, 0.3 * (high - low))
     sign = 1 if leg.stop >= leg.start else -1
@@ -311,7 +305,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     margins = (1e-4 * near, near)[::sign]
     kept = [
         piece
-        for piece in cut(scene, [leg.track])
+        for piece in leg.pieces
         if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
     ]
     reached = [float(s) for piece in kept for s in piece.places[[0, -1]]]
@@ -337,12 +331,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
         spans[-1] = (label, first, leg.stop)
     if leg.track.flush is None:
         spans = _drop_excursions(scene, leg, spans)
-    return _build_parts(scene, leg, spans, at_change)
-
-
-def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> list[Part]:
-    table, near = contact_table(scene), tolerance(scene)
-    parts = []
+    table, parts = contact_table(scene), list[Part]()
     for index, (label, first, last) in enumerate(spans):
         mine = name_contacts(table, label)
         begin, end = leg.at(first), leg.at(last)
@@ -360,9 +349,9 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             gained = tuple(c for c in touching if c not in mine)
             if not gained:
                 end = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
-        coordinate = int((np.abs(end - begin) / near).argmax())
+        coordinate = int((np.abs(end - begin) / tolerance(scene)).argmax())
         if leg.track.flush is not None:
-            coordinate = 0 if leg.track.flush[0] is None else 1
+            coordinate = 0 if leg.on_palm else 1
         parts.append(Part(mine, begin, end, gained, coordinate))
     return parts
 
@@ -400,6 +389,13 @@ class Leg:
     start: float  # start, stop: parameters of the curve
     stop: float
     near: float  # `NEAR` as a difference of the parameter
+    pieces: list[Piece]  # of the curve
+    note: str = ""  # the nearest border that it does not follow, and how far it is
+
+    @property
+    def on_palm(self) -> bool:
+        """Whether it is a border of an edge that lies flush on the palm."""
+        return self.track.flush is not None and self.track.flush[0] is None
 
     def at(self, place: float) -> Array:
         """The pose (x, phi) at a parameter, shape (2,) [m, rad]."""
@@ -412,21 +408,21 @@ def tolerance(scene: Scene) -> Array:
 
 
 def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
-    """The border that both ends are near, or a straight line."""
-    candidates = []
+    """The border that both ends are within `NEAR` of, or a straight line."""
+    followed, beside = list[tuple[bool, float, Leg]](), list[tuple[float, Leg]]()
     for leg, off in _list_near(scene, start, stop):
-        assert leg.track.flush is not None
-        if off < 1 and leg.track.flush[0] is None:
-            return leg
-        if off < 1:
-            # Both ends have to be near the same piece of the curve, or near one each.
-            reach = np.array([-leg.near, leg.near])
-            ranges = [piece.places[[0, -1]] + reach for piece in cut(scene, [leg.track])]
-            ends = leg.start, leg.stop
-            if all(any(low < place < high for low, high in ranges) for place in ends):
-                candidates.append((off, leg))
-    if candidates:
-        return min(candidates, key=lambda entry: entry[0])[1]
+        # Both ends have to be near the same piece of the curve, or near one each.
+        ranges = [piece.places[[0, -1]] + np.array([-leg.near, leg.near]) for piece in leg.pieces]
+        ends = leg.start, leg.stop
+        joined = all(any(low < place < high for low, high in ranges) for place in ends)
+        if off < 1 and (leg.on_palm or joined):
+            followed.append((not leg.on_palm, off, leg))
+        if leg.pieces:
+            beside.append((off, leg))
+    if followed:
+        return min(followed, key=lambda entry: entry[:2])[2]
+    off, nearest = min(beside, key=lambda entry: entry[0], default=(0.0, None))
+    note = "" if nearest is None or off < 1 else _describe_miss(scene, nearest, start, stop)
     near = tolerance(scene)
 
     def pose(s: Array) -> tuple[Array, Array]:
@@ -435,8 +431,8 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
 
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    track = Track(pose, lambda x, phi, closed: label_inside(scene, closed), places, np.inf)
-    return Leg(track, 0.0, 1.0, share)
+    track = Track(pose, lambda x, phi, closed: label_inside(scene, closed), places)
+    return Leg(track, 0.0, 1.0, share, cut(scene, [track]), note)
 
 
 def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:
@@ -452,7 +448,7 @@ def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, f
             off = max(abs(low - angle), abs(high - angle)) / near[1]
             if off < MISSED:
                 track = palm_track(scene, edge, angle, places)
-                yield Leg(track, float(start[0]), float(stop[0]), near[0]), off
+                yield Leg(track, float(start[0]), float(stop[0]), near[0], cut(scene, [track])), off
     for first, last, vertex in Window((left, right), (low - np.pi, high + np.pi)).bands(scene):
         if not (first - near[1] < low and high < last + near[1]):
             continue
@@ -463,7 +459,7 @@ def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, f
             if max(off_a, off_b) < MISSED and abs(a - b) > near[1]:
                 ends_on = np.clip([min(a, b) - near[1], max(a, b) + near[1]], first, last)
                 track = replace(track, places=np.linspace(ends_on[0], ends_on[1], PLACES))
-                yield Leg(track, a, b, near[1]), max(off_a, off_b)
+                yield Leg(track, a, b, near[1], cut(scene, [track])), max(off_a, off_b)
 
 
 def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
@@ -481,12 +477,8 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
     return float(places[k]), float(away[k])
 
 
-def describe_miss(scene: Scene, start: Array, stop: Array) -> str:
-    """The nearest border beside both ends of a straight leg, how far it is, and what is near."""
-    legs = [pair for pair in _list_near(scene, start, stop) if cut(scene, [pair[0].track])]
-    leg, off = min(legs, key=lambda pair: pair[1], default=(None, 0.0))
-    if leg is None or off < 1:
-        return ""
+def _describe_miss(scene: Scene, leg: Leg, start: Array, stop: Array) -> str:
+    """A border beside both ends of a straight leg, how far it is, and what is near."""
     assert leg.track.flush is not None
     finger, edge = leg.track.flush
     gaps = leg.at(leg.start) - start, leg.at(leg.stop) - stop
@@ -544,43 +536,47 @@ def write_template(
 
 def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:
     """The file for one hand and a start, over the size."""
-    corners, scale, heavy = len(vertices), size / _SIZE, weight / _MASS
-    finger = {
-        "length": ((0.22 if few else 0.14) * scale, "m, joint to tip centre"),
-        "radius": (0.005 * scale, "m, half thickness of the link"),
-        "inertia": (0.005 * heavy * scale**2, "kg m^2, about the joint"),
-        "viscous": (0.01 * heavy * scale**1.5, "N m s, friction of the joint"),
-        "dry": (0.01 * heavy * scale, "N m, dry friction of the joint"),
-        "torque_limit": (2.0 * heavy * scale, "N m"),
-    }
-    lines = [
-        f"# A polygon with {corners} corners slides to the left on edge 0. Units: m, kg, s, rad.",
-        _row("name", f'"{name}"', ""),
-        _row("epsilon", _show(0.05 * heavy), "N, least normal force of every contact"),
-        _row("gravity", "9.81", "m/s^2"),
-        "\n[object]",
-        f"# corners, anticlockwise [m]; the inertia is that of uniform density\n"
-        f"vertices = [{', '.join(f'[{_show(x)}, {_show(y)}]' for x, y in vertices)}]",
-        _row("mass", _show(weight), "kg"),
-    ]
-    for number, side, word in ((1, 1.6, "right"), (2, -0.2 if few else -1.6, "left")):
-        base = f"[{_show(side * size)}, {_show(-0.2 * size)}]"
-        lines += [f"\n{f'[fingers.{number}]':<{_COMMENTS}}# {word}", _row("base", base, "m, joint")]
-        lines += [_row(key, _show(value), text) for key, (value, text) in finger.items()]
-    lines.append(f"\n{'[friction]':<{_COMMENTS}}# coefficient with the object")
-    lines += [_row(part, "0.05", "") for part in ("palm", "finger1", "finger2")]
-    lines += ["\n[start]", _row("flush", "0", "this edge lies on the palm")]
-    lines += [_row("x", _show(start * size), "m, centroid; both fingers close on the object")]
-    text = "\n".join(lines) + "\n"
+    scale, heavy = size / _SIZE, weight / _MASS
+    finger = f"""\
+length = {_show((0.22 if few else 0.14) * scale)} # m, joint to tip centre
+radius = {_show(0.005 * scale)} # m, half thickness of the link
+inertia = {_show(0.005 * heavy * scale**2)} # kg m^2, about the joint
+viscous = {_show(0.01 * heavy * scale**1.5)} # N m s, friction of the joint
+dry = {_show(0.01 * heavy * scale)} # N m, dry friction of the joint
+torque_limit = {_show(2.0 * heavy * scale)} # N m"""
+    text = f"""\
+# A polygon with {len(vertices)} corners slides to the left on edge 0. Units: m, kg, s, rad.
+name = "{name}"
+epsilon = {_show(0.05 * heavy)} # N, least normal force of every contact
+gravity = 9.81 # m/s^2
+
+[object]
+# corners, anticlockwise [m]; the inertia is that of uniform density
+vertices = [{", ".join(f"[{_show(x)}, {_show(y)}]" for x, y in vertices)}]
+mass = {_show(weight)} # kg
+
+[fingers.1] # right
+base = [{_show(1.6 * size)}, {_show(-0.2 * size)}] # m, joint
+{finger}
+
+[fingers.2] # left
+base = [{_show((-0.2 if few else -1.6) * size)}, {_show(-0.2 * size)}] # m, joint
+{finger}
+
+[friction] # coefficient with the object
+palm = 0.05
+finger1 = 0.05
+finger2 = 0.05
+
+[start]
+flush = 0 # this edge lies on the palm
+x = {_show(start * size)} # m, centroid; both fingers close on the object
+"""
+    text = re.sub('^([^"\n]+) # ', lambda row: f"{row[1]:<{_COMMENTS}}# ", text, flags=re.MULTILINE)
     problem = build_problem(tomllib.loads(text))
     x, _, phi = (float(value) for value in problem.start[:3])
     route = list_formations(problem, (x, phi), ((start - 0.4) * size, phi))
     return text + "\n" + format_route(route)
-
-
-def _row(key: str, value: str, comment: str) -> str:
-    text = f"{key} = {value}"
-    return f"{text:<{_COMMENTS}}# {comment}" if comment else text
 
 
 def _show(value: float) -> str:

@@ -142,7 +142,13 @@ def build_map(
     inside = label_inside(scene, closed)
     free = inside[:, 0] != NOWHERE
     places, inside, z = places[free], inside[free], closed.z[free]
-    directions = _check_cells(problem, inside[:, [0, 2, 4]], z, limit)
+    labels, pose = inside[:, [0, 2, 4]], np.broadcast_to(np.eye(5)[[0, 2]], (len(z), 2, 5))
+    kinematics = evaluate_each(scene, labels, z)
+    matrix = np.concatenate([kinematics.A, pose], axis=1)
+    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
+    tangents = np.zeros((len(z), len(WAYS), 5))
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
+    directions = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
     return FormationMap(problem, x, phi, *parts, places, *directions)
@@ -214,20 +220,6 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     return tuple(crossings)
 
 
-def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> tuple[Flags, Flags]:
-    """Whether motions inside cells are feasible in the directions `WAYS`, (n, 4).
-
-    And where contact forces of one that would be are not unique, (n,).
-    """
-    scene, pose = problem.scene, np.broadcast_to(np.eye(5)[[0, 2]], (len(z), 2, 5))
-    kinematics = evaluate_each(scene, labels, z)
-    matrix = np.concatenate([kinematics.A, pose], axis=1)
-    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
-    tangents = np.zeros((len(z), len(WAYS), 5))
-    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
-    return _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
-
-
 def _check_motions(
     problem: Problem,
     labels: Numbers,
@@ -272,7 +264,21 @@ def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) 
     Or of phi in a range [deg]. InputError if both fingers reach the object nowhere.
     """
     scene = problem.scene
-    low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
+    if phi_deg is not None:
+        low, high = np.radians(phi_deg).tolist()
+    else:
+        angles = [float(problem.start[2])]
+        angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
+        angles += [v for p in problem.phases for row, v in p.until.poses if row == ROWS["phi"]]
+        angles += [goal.find_angle(scene, angles[-1]) for goal in problem.goals]
+        low, high = min(angles), max(angles)
+        around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(scene)
+        flush = np.array([angle for angle, _ in around])
+        # An edge that is flush at an end of the plan does not count.
+        before, after = flush[flush < low - 1e-6].max(), flush[flush > high + 1e-6].min()
+        # The next edge but one stays outside.
+        beyond = min(math.radians(6.0), float(after - before) / 8)
+        low, high = float(before) - beyond, float(after) + beyond
     left, right = find_reach(scene)
     grid = np.linspace(left, max(left, right), 60)
     _, obstacle = label_grid(scene, grid, np.linspace(low, high, 60))
@@ -281,22 +287,6 @@ def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) 
         raise InputError(problem.source, "fingers", "nowhere do both reach the object")
     step = grid[1] - grid[0]
     return Window((float(reached[0] - step), float(reached[-1] + step)), (low, high))
-
-
-def _cover_phases(problem: Problem) -> tuple[float, float]:
-    """Range of phi [rad] to a little beyond the flush angles around the phases."""
-    angles = [float(problem.start[2])]
-    angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
-    angles += [v for phase in problem.phases for row, v in phase.until.poses if row == ROWS["phi"]]
-    angles += [goal.find_angle(problem.scene, angles[-1]) for goal in problem.goals]
-    low, high = min(angles), max(angles)
-    around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
-    flush = np.array([angle for angle, _ in around])
-    # An edge that is flush at an end of the plan does not count.
-    before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
-    # The next edge but one stays outside.
-    beyond = min(math.radians(6.0), (after - before) / 8)
-    return before - beyond, after + beyond
 
 
 def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:

@@ -45,11 +45,6 @@ class End(Enum):
     """A contact is gained at speed: the velocity jumps onto the next phase's contacts."""
 
 
-def _name_contact(more: str = "") -> dict[str, str]:
-    """JSON Schema of the name of a contact, and of what may follow it."""
-    return {"type": "string", "pattern": f"^([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12])){more}$"}
-
-
 class ModeGuess(NamedTuple):
     """A contact mode of the initial guess of a phase, with time and pose at its end."""
 
@@ -60,7 +55,8 @@ class ModeGuess(NamedTuple):
 
 
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
-CONTACT = _name_contact()  # JSON Schema of the name of a contact
+_NAME = "([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12]))"
+CONTACT = {"type": "string", "pattern": f"^{_NAME}$"}  # JSON Schema of the name of a contact
 DWELL = FieldKind(
     lambda value, key: (read_share if isinstance(value, str) else NONNEGATIVE.read)(value, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
@@ -133,7 +129,13 @@ class Until:
         "contacts",
         "Contacts that touch throughout, such as v1-palm, v3-finger1, e2-tip1; with ' rolling' "
         "behind it one does not slide.",
-        leave({"type": "array", "minItems": 1, "items": _name_contact("( rolling)?")}),
+        leave(
+            {
+                "type": "array",
+                "minItems": 1,
+                "items": CONTACT | {"pattern": f"^{_NAME}( rolling)?$"},
+            }
+        ),
         attribute="formation",
     ),
     key(
@@ -195,10 +197,9 @@ class Goal:
     x: float | None = None
 
     def __str__(self) -> str:
+        text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
         if self.flush is not None:
             text = f"edge {self.flush} on the palm"
-        else:
-            text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
         return text if self.x is None else f"{text} at x = {self.x:g} m"
 
     def find_angle(self, scene: Scene, near: float) -> float:

@@ -55,7 +55,6 @@ INSIDE = 0.02  # least distance of the place from both ends of the border, over 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
 TRIED = 6  # most routes without a plan, beyond those asked for
 BEYOND = 1.1  # largest estimate of a route over that of the best one
-NEARBY = 30  # most places of `find_first`
 MEASURED, MORE = 24, 8  # most edges planned until there is a route, and after it
 SETTLED = 240  # most places that are settled to bound routes from below
 
@@ -163,9 +162,10 @@ class RouteSearch:
                     self.found.add(route.key)
                     yield route
                 continue
-            if route.edges and (chain := route.edges[-1].chain):
+            last = route.edges[-1] if route.edges else None
+            if last and last.chain and last.onwards:
                 before = Route(route.start, route.edges[:-1])
-                for edge in self.roadmap.go_on(chain, self.goal):
+                for edge in self.roadmap.go_on(last.chain, self.goal):
                     push(before.extend(edge))
             if times[place.key] >= (1 if place.landed else OFTEN):
                 continue
@@ -266,6 +266,8 @@ class RoutePlanner:
     before: Plan | None  # to the goals before
     search: RouteSearch
     options: PlanOptions
+    report: Reporter
+    wanted: int = 1  # number of plans
     jobs: int = 1  # most processes at the same time
     spent: float = 0.0  # [s]: estimated least time to the goals before
     first_only: bool = False  # whether any plan will do: then edges are not refined
@@ -273,7 +275,6 @@ class RoutePlanner:
     made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
     _measurements: int = 0
-    _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
 
     @cached_property
@@ -286,39 +287,35 @@ class RoutePlanner:
         """The roadmap of the search, which keeps plans."""
         return self.search.roadmap
 
-    def run(self, wanted: int, report: Callable[[str], None]) -> None:
-        """Search and plan until there are `wanted` plans, or no more routes."""
+    def run(self) -> None:
+        """Search and plan until there are as many plans as wanted, or no more routes."""
         for _ in range(TRIED):
             failed = len(self.failures)
-            self._look_by(EAGER, wanted, report)
+            self.look_by(EAGER)
             # Without a route by then, the other rule leads elsewhere, and as far.
-            most = CAREFUL.most if self.found else EAGER.most
-            self._look_by(CAREFUL._replace(most=most), wanted, report)
-            self.plan(wanted, report)
-            if len(self.made) >= wanted or len(self.failures) == failed:
+            self.look_by(CAREFUL if self.found else CAREFUL._replace(most=EAGER.most))
+            self.plan()
+            if len(self.made) >= self.wanted or len(self.failures) == failed:
                 return
             # A route without a plan bounds nothing.
             self.search.limit = math.inf
 
-    def find_first(self, report: Callable[[str], None], most: int = NEARBY) -> Route | None:
-        """The first route over few places whose edges through cells have plans."""
-        self._look_by(EAGER._replace(most=most), 1, report)
-        return self.found[0] if self.found else None
-
-    def plan(self, wanted: int, report: Callable[[str], None]) -> None:
+    def plan(self) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
         for route in sorted(self.found, key=self.estimate):
-            if len(self.made) >= wanted or len(self.failures) >= TRIED:
+            if len(self.made) >= self.wanted or len(self.failures) >= TRIED:
                 return
             if self._is_lost(route):
                 self.found.remove(route)
                 continue
             if not self.first_only:
-                self._refine(route, report)
-            report(f"planning a route of {sum(len(edge.steps) for edge in route.edges)} phases")
-            plan = self._plan(route, report)
+                self._refine(route)
+            self.report(
+                f"planning a route of {sum(len(edge.steps) for edge in route.edges)} phases"
+            )
+            plan = self._plan(route)
             if isinstance(plan, str) and self._take_others(route):
-                plan = self._plan(route, report)
+                plan = self._plan(route)
             # An interrupted one is still there, to be planned then.
             self.found.remove(route)
             if isinstance(plan, str):
@@ -338,7 +335,7 @@ class RoutePlanner:
         plans.update({edge: plans[edge][1:2] for edge in several})
         return bool(several)
 
-    def _plan(self, route: Route, report: Callable[[str], None]) -> Plan | str:
+    def _plan(self, route: Route) -> Plan | str:
         """The plan of the phases that are printed for a route.
 
         Their ends are those of plans of the route's edges. These are the initial guess, too, if
@@ -352,7 +349,7 @@ class RoutePlanner:
             options = replace(options, objective=Objective.TIME, duration=None)
         if scene.control_period:
             problem, options = free_torques(problem, options)
-        planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges), report)
+        planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges))
         if isinstance(planned, Lost):
             return planned
         found = [pair for part in planned for pair in part]
@@ -363,7 +360,7 @@ class RoutePlanner:
             phases = (*before, *list_printed(scene, found, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
-            plan = plan_phases(printed, self.options, self.roadmap.plans, report)
+            plan = plan_phases(printed, self.options, self.roadmap.plans, self.report)
             if isinstance(plan, Plan):
                 break
             if isinstance(plan, Lost) and alike:
@@ -388,7 +385,7 @@ class RoutePlanner:
         return route.edges[first : last + 1]
 
     def _plan_parts(
-        self, route: Route, problem: Problem, options: PlanOptions, report: Callable[[str], None]
+        self, route: Route, problem: Problem, options: PlanOptions
     ) -> list[PartPlan] | Lost:
         """Coarse plans of a route's parts, one after the other, or why one has none."""
         coarse = self.roadmap.coarse_plans
@@ -396,9 +393,9 @@ class RoutePlanner:
             tuple((edge, coarse[edge][0] if edge.in_cell else None) for edge in part)
             for part in split_route(route.edges)
         ]
-        report(f"planning the route, in parts: {len(parts)}")
+        self.report(f"planning the route, in parts: {len(parts)}")
         # Several processes would tell their progress at once.
-        tell, lost = report if self.jobs == 1 else Reporter(None), list[Lost]()
+        tell, lost = self.report if self.jobs == 1 else Reporter(None), list[Lost]()
 
         def plan_one(part: RoutePart) -> PartPlan | Lost | None:
             """Plan a part; None if another one has no plan."""
@@ -416,14 +413,8 @@ class RoutePlanner:
         wanted = takewhile(lambda k: not isinstance(known.get(keys[k]), Lost), order)
         new = [k for k in wanted if keys[k] not in known]
         tasks: list[Task[Any]] = [partial(plan_one, parts[k]) for k in new]
-        enough = BEYOND * self.estimate(route)
-        if self.jobs > 1 and not self.before and not self._bound:
-            # A bound up to more than the plan will take, computed beside it.
-            tasks.append(partial(bound_borders, self.search, enough))
         results = share(tasks, self.jobs)
-        for bound in results[len(new) :]:
-            self._bound = enough, bound
-        known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
+        known.update({keys[k]: made for k, made in zip(new, results, strict=True) if made})
         for k in order:
             if isinstance(made := known.get(keys[k]), Lost):
                 passed = sum(len((plan or edge).steps) for part in parts[:k] for edge, plan in part)
@@ -432,26 +423,18 @@ class RoutePlanner:
         # None is lost, and so all are planned.
         return [cast(PartPlan, known[key]) for key in keys]
 
-    def bound(self, duration: float, in_cells: bool) -> BorderBound:
-        """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
-        wanted = duration if in_cells else math.inf
-        enough, bound = self._bound or (0.0, None)
-        if bound is None or min(enough, wanted) <= bound.value < wanted:
-            return bound_borders(self.search, wanted)
-        return bound.up_to(wanted)
-
-    def _look_by(self, heuristic: Heuristic, wanted: int, report: Callable[[str], None]) -> None:
+    def look_by(self, heuristic: Heuristic) -> None:
         """Collect routes by a heuristic, while a better one is possible."""
         looked, most = 0, self._measurements + MEASURED
         for route in self.search.run(heuristic):
-            if len(self.found) >= wanted and self.estimate(route) > self._best:
+            if len(self.found) >= self.wanted and self.estimate(route) > self._best:
                 return
-            if looked > wanted + TRIED or self._measurements >= most:
+            if looked > self.wanted + TRIED or self._measurements >= most:
                 return
-            if self._measure(route, report):
+            if self._measure(route):
                 looked += 1
                 self.found.append(route)
-                if len(self.found) >= wanted:
+                if len(self.found) >= self.wanted:
                     self.search.limit = BEYOND * self._best
                     most = min(most, self._measurements + MORE)
 
@@ -460,7 +443,7 @@ class RoutePlanner:
         """About the least time of a route that is found [s]."""
         return min((self.estimate(route) for route in self.found), default=float("inf"))
 
-    def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
+    def _measure(self, route: Route) -> bool:
         """Plan the edges of a route that lead through cells; whether all have a plan."""
         if self._is_lost(route):
             return False
@@ -469,20 +452,20 @@ class RoutePlanner:
         new = [edge for edge in in_cells if edge not in plans]
         self._measurements += len(new)
         if new:
-            report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
-        plan = partial(plan_coarsely, self.free, options=self.options, further=True)
+            self.report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
+        plan = partial(plan_coarsely, self.free, options=self.options)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
         for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
         return all(plans[edge] for edge in in_cells)
 
-    def _refine(self, route: Route, report: Callable[[str], None]) -> None:
+    def _refine(self, route: Route) -> None:
         """Optimize the places where a route leaves borders for cells."""
         roadmap, searches = self.roadmap, dict[Edge, partial[list[CoarsePlan]]]()
         for edge, after in pairwise((*route.edges, None)):
             if edge is None or edge.left is None or edge in roadmap.refined:
                 continue
-            report(f"planning {describe_steps(edge.steps)} in other ways")
+            self.report(f"planning {describe_steps(edge.steps)} in other ways")
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
             (plan,) = roadmap.coarse_plans[edge]
@@ -553,10 +536,6 @@ class BorderBound(NamedTuple):
     # whether it is that of a route, or larger than what was asked for; otherwise more would have
     # had to be looked at
     complete: bool
-
-    def up_to(self, enough: float) -> BorderBound:
-        """The bound, at most `enough` [s]."""
-        return self if self.value < enough else BorderBound(enough, True)
 
 
 def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:

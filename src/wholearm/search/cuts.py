@@ -18,7 +18,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import Change, InfeasibleError, InputError, Parameter, WholearmError
-from ..common.signals import OutOfTime
+from ..common.signals import OutOfTime, Reporter
 from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, describe
 from ..mechanics.limits import EPSILON, make_limits
@@ -27,15 +27,16 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Goal, Phase, Problem
 from ..scene.model import Scene
-from .astar import EAGER, NEARBY, Route, RoutePlanner, RouteSearch
+from .astar import EAGER, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
-from .edges import DEPENDENT, Blocked, Edge, describe_steps, edge_along, point_out
+from .edges import DEPENDENT, Blocked, Chain, Edge, describe_steps, point_out
 from .places import make_place, require_reach
 from .roadmap import Roadmap
 
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
 FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero
 TRIED = 3  # Most numbers with which the goal is looked for
+NEARBY = 30  # Most places that are looked at beyond borders that a number opens
 SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
 """Lengths of fingers and distances of their bases that are tried, relative to the problem's."""
@@ -56,11 +57,6 @@ class Opening(NamedTuple):
         chosen = self.values if among is None else [self.values[k] for k in among]
         values = [value for value in chosen if not math.isnan(value)]
         return Change(self.parameter, max(values) if self.parameter.sign > 0 else min(values))
-
-    def list_open(self, change: Change) -> list[int]:
-        """Numbers of the borders that a change opens."""
-        sign = self.parameter.sign
-        return [k for k, value in enumerate(self.values) if sign * (change.value - value) >= 0]
 
 
 def list_cut(search: RouteSearch) -> list[Blocked]:
@@ -87,7 +83,7 @@ def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
     by_key: dict[str, tuple[Parameter, list[float]]] = {}
     for index, cut in enumerate(cuts):
-        formation, epsilon = cut.border.formation, cut.border.terms.epsilon
+        formation, epsilon = cut.border.formation, cut.border.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
             friction = number.key.startswith("friction")
             tried = number.value, 0.0 if friction else number.value * FARTHEST**number.sign
@@ -111,11 +107,10 @@ def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
     """The edge along a border of the changed problem, or why no motion follows it."""
     border, key = blocked.border, change.parameter.key
     if key == EPSILON:
-        border = replace(border, terms=border.terms._replace(epsilon=change.value))
+        border = replace(border, epsilon=change.value)
     else:
         border = replace(border, curve=change_curve(border.curve, key, change.value))
-    stop = replace(blocked.stop, scene=border.formation.scene)
-    return edge_along((border,), (1.0,), blocked.steps, stop)
+    return Chain((border,)).stop_at(blocked.steps[0].until)
 
 
 def find_opening(
@@ -134,16 +129,16 @@ def find_opening(
     report("looking for a number that opens the way")
     cuts, tried = list_cut(search)[:CUT], list[str]()
 
-    def find(
-        change: Change, beyond: Sequence[int], planned: bool
-    ) -> tuple[float, Sequence[int]] | None:
-        """About how long a route beyond some borders takes [s], and which of them it crosses."""
+    def find(opening: Opening, change: Change, planned: bool) -> tuple[float, Sequence[int]] | None:
+        """About how long a route beyond opened borders takes [s], and which of them it crosses."""
         try:
             changed = problem.with_(change.values)
         except InputError:
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
-        for k in beyond:
+        for k, value in enumerate(opening.values):
+            if not opening.parameter.sign * (change.value - value) >= 0:
+                continue
             before = search.reached.get(cuts[k].start.key)
             edge = edge_changed(cuts[k], change)
             if before is not None and isinstance(edge, Edge):
@@ -156,11 +151,11 @@ def find_opening(
 
     for opening in list_openings(cuts)[:TRIED]:
         most = opening.open_all()
-        route = find(most, opening.list_open(most), False)
+        route = find(opening, most, False)
         # Borders beyond those that the route crosses may need the larger change.
         least = most if route is None else opening.open_all(route[1])
         for change in dict.fromkeys((least, most)) if route else ():
-            reached = find(change, opening.list_open(change), True)
+            reached = find(opening, change, True)
             if reached is not None:
                 return _describe_reached(change, reached[0]), (change,)
         tried.append(str(most))
@@ -189,14 +184,12 @@ def _search_changed(
     search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
-    planner = RoutePlanner(changed, None, search, rough, first_only=True)
+    planner = RoutePlanner(changed, None, search, rough, Reporter(None), first_only=True)
     try:
-        route = planner.find_first(lambda _: None, most)
-        if route is None:
-            return None
+        planner.look_by(EAGER._replace(most=most))
         if not planned:
-            return route, route.estimate
-        planner.plan(1, lambda _: None)
+            return (planner.found[0], planner.found[0].estimate) if planner.found else None
+        planner.plan()
     except np.linalg.LinAlgError:
         return None
     return (planner.made[0][1], planner.made[0][0].duration) if planner.made else None

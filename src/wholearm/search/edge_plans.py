@@ -82,7 +82,6 @@ def plan_coarsely(
     edge: Edge,
     steps: tuple[EdgeStep, ...],
     options: PlanOptions,
-    further: bool = False,
     straight: bool = True,
     first_only: bool = False,
     stopped: CoarsePlan | None = None,
@@ -92,9 +91,8 @@ def plan_coarsely(
     Parameters
     ----------
     steps       the edge's, or others between the same places
-    further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
-    first_only  whether only the first guess is tried
+    first_only  whether only the first guess is tried; otherwise all those of a single phase are
     stopped     a plan that stops where it leaves the border, as guess of one that does not
     """
     from ..planning.time_domain.time_plan import try_phases
@@ -122,7 +120,8 @@ def plan_coarsely(
             if before is None:
                 return None
             given = [*before, *stopped.begun]
-        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only, given)
+        further = alone and not first_only
+        plans = try_phases(single, phases, z, rough, towards, further, first_only, given)
     except (WholearmError, np.linalg.LinAlgError):
         return None
     if plans is None:

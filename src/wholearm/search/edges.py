@@ -49,60 +49,18 @@ class BorderLimits(NamedTuple):
     steps: Array  # (n,) [m]: lengths of the intervals
     part: Array  # (n,): share of each interval before its place
 
-    def with_speed_ratio(self, ratio: float) -> BorderLimits:
-        """The same with the path parameter scaled by `ratio`."""
-        return self._replace(limits=self.limits.scale(ratio), steps=self.steps / ratio)
 
-
-def find_border_limits(
-    curve: Curve, epsilon: float, uniqueness_margin: float, intervals: int
-) -> BorderLimits:
-    """Limits along a curve with arc length as parameter; epsilon [N] is the least normal force."""
-    terms = PathTerms((curve,), epsilon)
-    grid = terms.make_grid(intervals)
-    nodes, count = terms.place(grid.angles), len(grid.owners) + 2
-    middles = terms.place((grid.angles[1:] + grid.angles[:-1]) / 2)
-    last = len(curve.segments) - 1
-    checked = [
-        np.linspace(part.start, min(part.stop, curve.length), CHECKED) for part in curve.segments
-    ]
-    s = np.concatenate([[0.0, curve.length], middles, *checked])
-    owners = np.concatenate([[0, last], grid.owners, np.repeat(np.arange(last + 1), CHECKED)])
-    steps = np.diff(nodes)
-    try:
-        at = curve.evaluate(s)
-        closed, clear = _find_ambiguity(curve, s, at, owners, uniqueness_margin)
-        first = Kinematics(*(array[:count] for array in at.kinematics))
-        nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
-        limits = find_limits(curve, epsilon, nodes_at, owners[:count])
-    except np.linalg.LinAlgError:
-        z, none = np.zeros((len(steps), 5)), np.zeros(len(steps))
-        limits = PathLimits(np.zeros((len(steps), 1, 4)), none)
-        return BorderLimits(DEPENDENT, 0.0, "", "", z, limits, steps, none)
-    reasons = list[str]()
-    for k, sign, what in ((0, 1.0, "begins"), (1, -1.0, "ends")):
-        here, reason = limits.pick(k), ""
-        if not here.can_rest(sign):
-            reason = f"no motion {what} at rest at {describe_pose(at.z[k])}"
-        elif curve.formation.scene.has_slow_motors and not here.holds:
-            reason = f"no torques hold the object on the verge of it at {describe_pose(at.z[k])}"
-        reasons.append(reason)
-    begins, ends = reasons
-    inner = slice(2, count)
-    part = (middles - nodes[:-1]) / steps
-    return BorderLimits(closed, clear, begins, ends, at.z[inner], limits.pick(inner), steps, part)
-
-
-def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
+def estimate_duration(borders: Sequence[BorderLimits], ratios: Sequence[float]) -> float | str:
     """Estimated duration [s] of a motion along borders from rest to rest, or why there is none.
 
-    Speed sweep with the limits of one place in each interval. `limits` have such speed ratios that
-    the speed is continuous where two borders meet.
+    Speed sweep with the limits of one place in each interval. With speed `ratios` the speed is
+    continuous where two borders meet.
     """
-    rows, cap = (np.concatenate(column) for column in zip(*(b.limits for b in limits), strict=True))
-    steps, part, z = (
-        np.concatenate([getattr(b, key) for b in limits]) for key in ("steps", "part", "z")
-    )
+    scaled = [
+        (*b.limits.scale(ratio), b.steps / ratio, b.part, b.z)
+        for b, ratio in zip(borders, ratios, strict=True)
+    ]
+    rows, cap, steps, part, z = (np.concatenate(column) for column in zip(*scaled, strict=True))
     try:
         return float(find_duration(speed_sweep(PathLimits(rows, cap), steps, part).b, steps))
     except NoMotionError as error:
@@ -145,13 +103,6 @@ def _find_ambiguity(
     return f"{names} ambiguous: uniqueness margin {ratio:.2f} at {describe_pose(at.z[row])}", clear
 
 
-class Terms(NamedTuple):
-    """Least normal force [N], and least uniqueness margin (P-matrix)."""
-
-    epsilon: float
-    uniqueness_margin: float
-
-
 class EdgeStep(NamedTuple):
     """One phase of an edge."""
 
@@ -171,33 +122,34 @@ class Edge:
     stop: RoadmapPlace
     steps: tuple[EdgeStep, ...]
     estimate: float  # [s]: of its least time
-    # whether it leads through a cell: then the planner optimizes its end, the estimate is that of
-    # straight paths, and the bound is zero
-    in_cell: bool = False
+    chain: Chain | None = None  # borders that it follows, if it leads through no cell
+    onwards: bool = False  # whether motions may go on beyond its end without a stop; not at a goal
     left: Curve | None = None  # the border that it leaves for the cell
     share: float = 0.0  # the part of that which it follows
-    borders: tuple[BorderEdge, ...] = ()  # those that it follows, if it leads through no cell
-    ratios: tuple[float, ...] = ()  # their speed ratios, with which the speed is continuous
-    # these borders, where motions may go on beyond its end without a stop; none at a goal
-    chain: Chain | None = None
+
+    @property
+    def in_cell(self) -> bool:
+        """Whether it leads through a cell, where the planner optimizes its end."""
+        return self.chain is None
 
     @cached_property
     def bound(self) -> float:
         """Lower bound of the duration on a coarse grid [s]."""
-        if self.in_cell:
-            return 0.0
-        return max(0.0, bound_roughly(self._curves, self.borders[0].terms.epsilon, INTERVALS))
+        return max(0.0, bound_roughly(*self._path, INTERVALS))
 
     @cached_property
     def fine_bound(self) -> float:
         """Lower bound on a refined grid, up to rounding [s]."""
-        bound = bound_least_time(self._curves, self.borders[0].terms.epsilon)
+        bound = bound_least_time(*self._path)
         return max(ROUGHLY * self.bound, bound.value if bound else 0.0)
 
     @property
-    def _curves(self) -> list[Curve]:
-        pairs = zip(self.borders, self.ratios, strict=True)
-        return [border.curve.with_speed_ratio(ratio) for border, ratio in pairs]
+    def _path(self) -> tuple[list[Curve], float]:
+        """Curves of the borders, and the least normal force [N]."""
+        assert self.chain is not None
+        pairs = zip(self.chain.borders, self.chain.ratios, strict=True)
+        curves = [border.curve.with_speed_ratio(ratio) for border, ratio in pairs]
+        return curves, self.chain.borders[0].epsilon
 
 
 class Blocked(NamedTuple):
@@ -216,7 +168,8 @@ class BorderEdge:
 
     start: RoadmapPlace
     curve: Curve
-    terms: Terms
+    epsilon: float  # [N]: least normal force
+    uniqueness_margin: float  # the least one (P-matrix)
 
     def __getstate__(self) -> dict[str, Any]:
         # Limits are large, and soon computed again.
@@ -241,7 +194,49 @@ class BorderEdge:
     @cached_property
     def limits(self) -> BorderLimits:
         """Limits of motions along it, on the usual grid."""
-        return find_border_limits(self.curve, *self.terms, INTERVALS)
+        return self.find_limits(INTERVALS)
+
+    def find_limits(self, intervals: int) -> BorderLimits:
+        """Limits of motions along it, with arc length as parameter."""
+        curve = self.curve
+        terms = PathTerms((curve,), self.epsilon)
+        grid = terms.make_grid(intervals)
+        nodes, count = terms.place(grid.angles), len(grid.owners) + 2
+        middles = terms.place((grid.angles[1:] + grid.angles[:-1]) / 2)
+        last = len(curve.segments) - 1
+        checked = [
+            np.linspace(part.start, min(part.stop, curve.length), CHECKED)
+            for part in curve.segments
+        ]
+        s = np.concatenate([[0.0, curve.length], middles, *checked])
+        owners = np.concatenate([[0, last], grid.owners, np.repeat(np.arange(last + 1), CHECKED)])
+        steps = np.diff(nodes)
+        try:
+            at = curve.evaluate(s)
+            closed, clear = _find_ambiguity(curve, s, at, owners, self.uniqueness_margin)
+            first = Kinematics(*(array[:count] for array in at.kinematics))
+            nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
+            limits = find_limits(curve, self.epsilon, nodes_at, owners[:count])
+        except np.linalg.LinAlgError:
+            z, none = np.zeros((len(steps), 5)), np.zeros(len(steps))
+            limits = PathLimits(np.zeros((len(steps), 1, 4)), none)
+            return BorderLimits(DEPENDENT, 0.0, "", "", z, limits, steps, none)
+        reasons = list[str]()
+        for k, sign, what in ((0, 1.0, "begins"), (1, -1.0, "ends")):
+            here, reason = limits.pick(k), ""
+            if not here.can_rest(sign):
+                reason = f"no motion {what} at rest at {describe_pose(at.z[k])}"
+            elif curve.formation.scene.has_slow_motors and not here.holds:
+                reason = (
+                    f"no torques hold the object on the verge of it at {describe_pose(at.z[k])}"
+                )
+            reasons.append(reason)
+        begins, ends = reasons
+        inner = slice(2, count)
+        part = (middles - nodes[:-1]) / steps
+        return BorderLimits(
+            closed, clear, begins, ends, at.z[inner], limits.pick(inner), steps, part
+        )
 
     @property
     def formation(self) -> Formation:
@@ -249,7 +244,9 @@ class BorderEdge:
         return self.curve.formation
 
 
-def follow_borders(place: RoadmapPlace, formation: Formation, terms: Terms) -> list[BorderEdge]:
+def follow_borders(
+    place: RoadmapPlace, formation: Formation, epsilon: float, uniqueness_margin: float
+) -> list[BorderEdge]:
     """The border of a formation from a place, in both directions."""
     headings, least = find_headings(formation, place.z), HELD * place.scene.scales.length
     if not headings:
@@ -261,7 +258,7 @@ def follow_borders(place: RoadmapPlace, formation: Formation, terms: Terms) -> l
         if limit >= -BARRED * least:
             curve = trace_curve(formation, place.z, heading, Until())
             if curve.length > least and curve.is_regular:
-                borders.append(BorderEdge(place, curve, terms))
+                borders.append(BorderEdge(place, curve, epsilon, uniqueness_margin))
     return borders
 
 
@@ -294,7 +291,7 @@ def time_parts(border: BorderEdge, shares: Array) -> Array:
     s = lengths[:, None] * places
     stops = np.array([each.stop for each in curve.segments[:-1]])
     point, segment = curve.evaluate(s.ravel()), np.searchsorted(stops, s.ravel())
-    rows, cap = find_limits(curve, border.terms.epsilon, point, segment)
+    rows, cap = find_limits(curve, border.epsilon, point, segment)
     limits = PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
     # With the share of each part as path parameter.
     motion = speed_sweep(limits.scale(lengths[:, None]), steps, part, sweeps=2)
@@ -306,9 +303,9 @@ def time_parts(border: BorderEdge, shares: Array) -> Array:
 class Chain:
     """Borders that are followed to their ends in motion, and one after them."""
 
-    steps: tuple[EdgeStep, ...]  # phases along those that are followed whole
-    borders: tuple[BorderEdge, ...]  # these, and the last one
-    ratios: tuple[float, ...]  # speed ratios of all borders: the speed is continuous
+    borders: tuple[BorderEdge, ...]
+    steps: tuple[EdgeStep, ...] = ()  # phases along all but the last one
+    ratios: tuple[float, ...] = (1.0,)  # speed ratios of all borders: the speed is continuous
 
     def can_enter(self, formation: Formation) -> bool:
         """Whether a formation keeps the gained contact and has no others that are new."""
@@ -329,60 +326,41 @@ class Chain:
             phase = Phase(0, last.formation, Until(contact=gained), end)
             join = compute_curve_impact(phase, last.curve, following.curve)
             if join.possible and np.isfinite(join.ratio):
-                return Chain(
-                    (*self.steps, EdgeStep(last.formation.contacts, phase.until, end)),
-                    (*self.borders, following),
-                    (*self.ratios, self.ratios[-1] * join.ratio),
-                )
+                steps = (*self.steps, EdgeStep(last.formation.contacts, phase.until, end))
+                ratios = (*self.ratios, self.ratios[-1] * join.ratio)
+                return Chain((*self.borders, following), steps, ratios)
         return None
 
     @cached_property
     def edge(self) -> Edge | Blocked | None:
         """The edge along all of it; None where the last border ends at an obstacle."""
-        last = self.borders[-1]
-        if last.gained is None:
-            return None
-        edge = self._edge(Until(contact=last.gained), last)
-        return replace(edge, chain=self) if isinstance(edge, Edge) else edge
+        gained = self.borders[-1].gained
+        return None if gained is None else self.stop_at(Until(contact=gained), onwards=True)
 
     def end_at(self, goal: Goal) -> Edge | Blocked | None:
         """The edge to a goal on the last border; None if there is none."""
-        last = self.borders[-1]
+        *before, last = self.borders
         place = measure_along(last.curve, goal)
         if place is None:
             return None
         curve = replace(last.curve, length=place[0], ending="", reached=True)
-        return self._edge(place[1], replace(last, curve=curve))
+        chain = replace(self, borders=(*before, replace(last, curve=curve)))
+        return chain.stop_at(place[1])
 
-    def _edge(self, until: Until, last: BorderEdge) -> Edge | Blocked:
-        """The edge to rest at the end of the last border, or of a part of it."""
+    def stop_at(self, until: Until, onwards: bool = False) -> Edge | Blocked:
+        """The edge to rest at the end of the last border, without a stop between.
+
+        Motions can pass all borders but the last one.
+        """
+        first, last = self.borders[0], self.borders[-1]
         steps = (*self.steps, EdgeStep(last.formation.contacts, until))
-        return edge_along((*self.borders[:-1], last), self.ratios, steps, last.stop)
-
-
-def edge_along(
-    borders: tuple[BorderEdge, ...],
-    ratios: tuple[float, ...],
-    steps: tuple[EdgeStep, ...],
-    stop: RoadmapPlace,
-) -> Edge | Blocked:
-    """The edge along borders without a stop between; motions can pass all but the last one.
-
-    With speed `ratios` the speed is continuous where two borders meet.
-    """
-    start, last = borders[0].start, borders[-1].limits
-    reason = last.closed or borders[0].limits.begins
-    if reason:
-        return Blocked(start, steps, reason, stop, borders[0])
-    duration: float | str = last.ends
-    # Where motions hardly pass, a coarse grid may let none pass.
-    for intervals in () if last.ends else (INTERVALS, FINE * INTERVALS):
-        limits = [border.limits for border in borders]
-        if intervals != INTERVALS:
-            limits = [find_border_limits(b.curve, *b.terms, intervals) for b in borders]
-        pairs = zip(limits, ratios, strict=True)
-        limits = [each.with_speed_ratio(ratio) for each, ratio in pairs]
-        duration = estimate_duration(limits)
-        if not isinstance(duration, str):
-            return Edge(start, stop, steps, duration, borders=borders, ratios=ratios)
-    return Blocked(start, steps, Unstopped(duration), stop, borders[0])
+        reason = last.limits.closed or first.limits.begins or Unstopped(last.limits.ends)
+        # Where motions hardly pass, a coarse grid may let none pass.
+        for intervals in () if reason else (INTERVALS, FINE * INTERVALS):
+            fine = intervals != INTERVALS
+            limits = [b.find_limits(intervals) if fine else b.limits for b in self.borders]
+            duration = estimate_duration(limits, self.ratios)
+            if not isinstance(duration, str):
+                return Edge(first.start, last.stop, steps, duration, self, onwards)
+            reason = Unstopped(duration)
+        return Blocked(first.start, steps, reason, last.stop, first)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import pickle
 import sys
 import time
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
 from ..problem.table import SAME, describe_phase, describe_scene, write_toml
-from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
+from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch, bound_borders
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edges import Blocked
 from .places import is_at, make_place, require_reach
@@ -41,7 +41,7 @@ from .roadmap import LONGEST, Roadmap
 
 LARGEST = 200_000_000  # Most bytes of a stored roadmap
 ROADMAPS = 4  # scenes whose roadmaps are kept in memory
-_roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
+_roadmaps = dict[str, Roadmap]()
 
 
 @exclusive
@@ -107,16 +107,11 @@ def find_route(
                 reason = f"{goal} holds already where the motion starts"
                 raise InputError(problem.source, name_goal(problem.goals, index), reason)
             require_reach(problem.scene, goal, float(start[2]))
-            planner = RoutePlanner(
-                problem,
-                before[-1].plan if before else None,
-                RouteSearch(roadmap, place, goal),
-                plan_options,
-                jobs,
-                spent,
-            )
-            count = alternatives if index + 1 == len(problem.goals) else 0
-            before.append(_plan_to_goal(planner, count, report, hurry))
+            search, last = RouteSearch(roadmap, place, goal), before[-1].plan if before else None
+            wanted = 1 + (alternatives if index + 1 == len(problem.goals) else 0)
+            given = problem, last, search, plan_options, report, wanted, jobs, spent
+            planner = RoutePlanner(*given)
+            before.append(_plan_to_goal(planner, hurry))
             start, spent = before[-1].route.stop.z, planner.estimate(before[-1].route)
         if cache is not None:
             try:
@@ -141,7 +136,7 @@ def get_roadmap(
         roadmap = load_roadmap(Path(cache), key)
     _roadmaps[key] = roadmap = roadmap or Roadmap(problem, options.uniqueness_margin)
     while len(_roadmaps) > ROADMAPS:
-        _roadmaps.popitem(last=False)
+        del _roadmaps[next(iter(_roadmaps))]  # the one that was used least recently
     return key, roadmap
 
 
@@ -150,15 +145,13 @@ def forget_roadmaps() -> None:
     _roadmaps.clear()
 
 
-def _plan_to_goal(
-    planner: RoutePlanner, alternatives: int, report: Reporter, hurry: Callable[[], None] | None
-) -> Answer:
+def _plan_to_goal(planner: RoutePlanner, hurry: Callable[[], None] | None) -> Answer:
     """Plan routes to one goal, with a lower bound of the best one."""
     start, complete, search, made = time.process_time(), False, planner.search, planner.made
     try:
         with yielding():
-            report("looking for routes")
-            planner.run(1 + alternatives, report)
+            planner.report("looking for routes")
+            planner.run()
         complete = True
     except OutOfTime:
         if not made:
@@ -169,20 +162,21 @@ def _plan_to_goal(
                 count = sum(len(edge.steps) for edge in best.edges)
                 duration = planner.estimate(best)
                 text += f", a route of {count} phases found, of about {duration:.3g} s"
-            raise SolverError(f"{text}; what it was at: {report.last}") from None
+            raise SolverError(f"{text}; what it was at: {planner.report.last}") from None
     except KeyboardInterrupt:
         if hurry is None or not (made or planner.found):
             raise
         if not made:
             hurry()
-            planner.first_only = True
-            planner.plan(1, report)
+            planner.first_only, planner.wanted = True, 1
+            planner.plan()
     except np.linalg.LinAlgError:
         # Dependent contacts at a place that the search has reached.
         if not made:
-            planner.plan(1, report)
+            planner.wanted = 1
+            planner.plan()
     if not made:
-        raise _explain(planner, time.process_time() - start, report, hurry)
+        raise _explain(planner, time.process_time() - start, hurry)
     sign = -1 if planner.options.goal is Objective.MARGIN else 1
     made.sort(key=lambda pair: sign * pair[0].value)
     plan, route = made[0]
@@ -190,9 +184,9 @@ def _plan_to_goal(
     if complete and not planner.before:
         complete = False
         with _ending(hurry):
-            bound = planner.bound(plan.duration, route.in_cells)
+            bound = bound_borders(search, plan.duration if route.in_cells else math.inf)
             complete = True
-    others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
+    others = tuple(Alternative(other) for other, _ in made[1 : planner.wanted])
     failures, blocked = tuple(planner.failures), tuple(search.blocked)
     return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
 
@@ -209,13 +203,13 @@ def _ending(hurry: Callable[[], None] | None) -> Iterator[None]:
 
 
 def _explain(
-    planner: RoutePlanner, seconds: float, report: Reporter, hurry: Callable[[], None] | None
+    planner: RoutePlanner, seconds: float, hurry: Callable[[], None] | None
 ) -> InfeasibleError:
     """Why nothing leads to a goal, after so many seconds of search [s]."""
     search, problem, options = planner.search, planner.problem, planner.options
     opening, changes, text = "", tuple[Change, ...](), ""
     with _ending(hurry):
-        opening, changes = find_opening(search, problem, options, seconds, report)
+        opening, changes = find_opening(search, problem, options, seconds, planner.report)
         explain = partial(explain_block, problem, options)
         text = describe_block(search, planner.failures, opening, explain)
     text = text or describe_block(search, planner.failures, opening)

@@ -118,12 +118,8 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
     distance = EndDistance(scene, until, curve.start)
     if distance.measure(curve.start[None])[0] < HELD:
         return None
-
-    def measure_left(z: Array) -> Array:
-        return distance.measure(z)[:, None]
-
-    crossings = filter(None, (find_crossing(panel, measure_left) for panel in curve.panels))
-    s = next((s for s, _ in crossings), math.inf)
+    crossings = (find_crossing(p, lambda z: distance.measure(z)[:, None]) for p in curve.panels)
+    s = next((crossing[0] for crossing in crossings if crossing), math.inf)
     if s > curve.length:
         return None
     x = float(curve.interpolate(np.array([s]))[0][0, 0])

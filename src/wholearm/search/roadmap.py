@@ -38,7 +38,6 @@ from .edges import (
     Chain,
     Edge,
     EdgeStep,
-    Terms,
     Unstopped,
     follow_borders,
     point_out,
@@ -126,13 +125,12 @@ class Roadmap:
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
         self.scene, self.epsilon = problem.scene, problem.epsilon
-        self.terms = Terms(problem.epsilon, uniqueness_margin)
+        self.uniqueness_margin = uniqueness_margin
         self.refined: set[Edge] = set()
         self._formations: dict[frozenset[Contact], Formation] = {}
         self.plans: dict[object, Plan | str] = {}
         self.coarse_plans: dict[Edge, list[CoarsePlan]] = {}
         self.part_plans: dict[object, PartPlan | Lost] = {}
-        self._releases: dict[BorderEdge, list[Edge]] = {}
         self._known: dict[tuple[object, ...], Any] = {}
 
     def _once(self, make: Callable[[], T], *key: object) -> T:
@@ -148,25 +146,14 @@ class Roadmap:
             if closed and (chain is None or chain.can_enter(formation)):
                 # The same contacts, in whatever order, are one formation, compiled once.
                 shared = self._formations.setdefault(frozenset(formation.contacts), formation)
-                make = partial(follow_borders, closed, shared, self.terms)
+                given = closed, shared, self.epsilon, self.uniqueness_margin
+                make = partial(follow_borders, *given)
                 borders += self._once(make, place.key, formation.contacts)
         return borders
 
     def follow(self, place: RoadmapPlace) -> list[Chain]:
         """Borders from a place."""
-        return self._once(
-            lambda: [Chain((), (border,), (1.0,)) for border in self.trace(place)], place.key
-        )
-
-    def extend(self, chain: Chain) -> list[Chain]:
-        """Chains with one more border entered in motion."""
-        last = chain.borders[-1]
-        if last.gained is None or len(chain.borders) == LONGEST:
-            return []
-        chains = self._once(
-            lambda: [chain.extend(border) for border in self.trace(last.stop, chain)], chain.borders
-        )
-        return [longer for longer in chains if longer]
+        return self._once(lambda: [Chain((b,)) for b in self.trace(place)], place.key)
 
     def set_out(self, place: RoadmapPlace, goal: Goal) -> Iterator[Edge | Blocked]:
         """Edges along borders from a place, along several only where a motion cannot stop."""
@@ -175,7 +162,13 @@ class Roadmap:
 
     def go_on(self, chain: Chain, goal: Goal) -> Iterator[Edge]:
         """Feasible edges that pass the end of a chain in motion; further ones as in `set_out`."""
-        for longer in self.extend(chain):
+        last = chain.borders[-1]
+        if last.gained is None or len(chain.borders) == LONGEST:
+            return
+        chains = self._once(
+            lambda: [chain.extend(border) for border in self.trace(last.stop, chain)], chain.borders
+        )
+        for longer in filter(None, chains):
             yield from (e for e in self._list_ends(longer, goal) if isinstance(e, Edge))
 
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Edge | Blocked]:
@@ -193,7 +186,7 @@ class Roadmap:
             edge = waiting.pop()
             if isinstance(edge, Edge):
                 yield edge
-                if edge.chain:
+                if edge.chain and edge.onwards:
                     waiting += self.go_on(edge.chain, goal)
 
     def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Edge]:
@@ -207,9 +200,7 @@ class Roadmap:
 
         Those of all borders `among` are computed together, which takes less time.
         """
-        if border in self._releases:
-            return self._releases[border]
-        borders = [other for other in among if other not in self._releases]
+        borders = [each for each in among if ("release", each) not in self._known]
         sources = dict[RoadmapPlace, tuple[BorderEdge, float, float]]()
         for each in borders:
             times = time_parts(each, RELEASES)
@@ -229,8 +220,9 @@ class Roadmap:
                 whole = replace(edge, start=left.start, steps=steps, estimate=duration)
                 best[key] = replace(whole, left=left.curve, share=share)
         for each in borders:
-            self._releases[each] = [edge for (left, _), edge in best.items() if left is each]
-        return self._releases[border]
+            edges = [edge for (left, _), edge in best.items() if left is each]
+            self._known["release", each] = edges
+        return cast(list[Edge], self._known["release", border])
 
     def land_at(self, edges: Sequence[Edge], goal: Goal) -> list[Edge]:
         """Copies of edges that land on the edge of a goal with x, moved to land at this x.
@@ -286,7 +278,7 @@ class Roadmap:
                 (z,) = place_at(scene, labels[:1], poses[inside][k : k + 1])
                 stop = RoadmapPlace(scene, z, formation.contacts, landed=True)
                 step = EdgeStep(formation.contacts, until)
-                edges.append(Edge(place, stop, (step,), float(times[k]), True))
+                edges.append(Edge(place, stop, (step,), float(times[k])))
         return edges
 
 
@@ -321,7 +313,7 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
         contacts, gained = tuple(table[c] for c in rays.labels[k]), table[rays.gained[k]]
         step, start = EdgeStep(contacts, Until(contact=gained)), places[rays.sources[k]]
         stop = RoadmapPlace(scene, end, (*contacts, gained), landed=True)
-        edges.append(Edge(start, stop, (step,), float(times[k]), True))
+        edges.append(Edge(start, stop, (step,), float(times[k])))
     return edges
 
 
