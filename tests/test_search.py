@@ -91,7 +91,9 @@ def test_no_route_along_borders_is_faster() -> None:
     bound = bound_borders(own, 1.0)
     least = sum(edge.fine_bound for edge in route.edges)
     assert bound.complete and 0.99 * route.estimate < bound.value <= least * (1 + 1e-9)
-    assert bound_borders(own, 0.05) == (0.05, True)
+    assert bound_borders(own, 0.05).value == 0.05
+    # A bound up to more says what one up to less does.
+    assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
 
 
 def test_under_rate_limits_motions_begin_on_borders_where_torques_hold() -> None:

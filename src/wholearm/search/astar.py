@@ -275,6 +275,7 @@ class RoutePlanner:
     made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
     _measurements: int = 0
+    _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
     _lost: list[tuple[Edge, ...]] = field(default_factory=list)
 
     @cached_property
@@ -413,8 +414,14 @@ class RoutePlanner:
         wanted = takewhile(lambda k: not isinstance(known.get(keys[k]), Lost), order)
         new = [k for k in wanted if keys[k] not in known]
         tasks: list[Task[Any]] = [partial(plan_one, parts[k]) for k in new]
+        enough = BEYOND * self.estimate(route)
+        if self.jobs > 1 and not self.before and not self._bound:
+            # A bound up to more than the plan will take, computed beside it.
+            tasks.append(partial(bound_borders, self.search, enough))
         results = share(tasks, self.jobs)
-        known.update({keys[k]: made for k, made in zip(new, results, strict=True) if made})
+        for bound in results[len(new) :]:
+            self._bound = enough, bound
+        known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
         for k in order:
             if isinstance(made := known.get(keys[k]), Lost):
                 passed = sum(len((plan or edge).steps) for part in parts[:k] for edge, plan in part)
@@ -422,6 +429,14 @@ class RoutePlanner:
                 return made
         # None is lost, and so all are planned.
         return [cast(PartPlan, known[key]) for key in keys]
+
+    def bound(self, duration: float, in_cells: bool) -> BorderBound:
+        """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
+        wanted = duration if in_cells else math.inf
+        enough, bound = self._bound or (0.0, None)
+        if bound is None or min(enough, wanted) <= bound.value < wanted:
+            return bound_borders(self.search, wanted)
+        return bound.up_to(wanted)
 
     def look_by(self, heuristic: Heuristic) -> None:
         """Collect routes by a heuristic, while a better one is possible."""
@@ -536,6 +551,10 @@ class BorderBound(NamedTuple):
     # whether it is that of a route, or larger than what was asked for; otherwise more would have
     # had to be looked at
     complete: bool
+
+    def up_to(self, enough: float) -> BorderBound:
+        """The bound, at most `enough` [s]."""
+        return self if self.value < enough else BorderBound(enough, True)
 
 
 def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import pickle
 import sys
 import time
 import warnings
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
 from ..problem.table import SAME, describe_phase, describe_scene, write_toml
-from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch, bound_borders
+from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edges import Blocked
 from .places import is_at, make_place, require_reach
@@ -41,7 +41,7 @@ from .roadmap import LONGEST, Roadmap
 
 LARGEST = 200_000_000  # Most bytes of a stored roadmap
 ROADMAPS = 4  # scenes whose roadmaps are kept in memory
-_roadmaps = dict[str, Roadmap]()
+_roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
 
 @exclusive
@@ -136,7 +136,7 @@ def get_roadmap(
         roadmap = load_roadmap(Path(cache), key)
     _roadmaps[key] = roadmap = roadmap or Roadmap(problem, options.uniqueness_margin)
     while len(_roadmaps) > ROADMAPS:
-        del _roadmaps[next(iter(_roadmaps))]  # the one that was used least recently
+        _roadmaps.popitem(last=False)
     return key, roadmap
 
 
@@ -184,7 +184,7 @@ def _plan_to_goal(planner: RoutePlanner, hurry: Callable[[], None] | None) -> An
     if complete and not planner.before:
         complete = False
         with _ending(hurry):
-            bound = bound_borders(search, plan.duration if route.in_cells else math.inf)
+            bound = planner.bound(plan.duration, route.in_cells)
             complete = True
     others = tuple(Alternative(other) for other, _ in made[1 : planner.wanted])
     failures, blocked = tuple(planner.failures), tuple(search.blocked)
