@@ -240,10 +240,8 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
         border = BorderEdge(place, curve, EPSILON, 0.0)
         least = bound_least_time([curve], EPSILON)
         assert least is not None
-        of_border = (
-            estimate_duration([border.limits], [1.0]),
-            time_parts(border, np.array([1.0]))[0],
-        )
+        (part,), whole = time_parts(border, np.ones(1)), estimate_duration([border.limits], [1.0])
+        of_border = whole, part
         of_cell = time_paths(formation.scene, epsilon, *path)[0]
         return np.array([least.value, look_along([curve], EPSILON, 50), *of_border, of_cell])
 

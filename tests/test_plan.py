@@ -208,12 +208,8 @@ SLOW = [
     for objective in ("effort", "margin")
     if (name, objective) != ("square", "effort")
 ]
-SLOW += [
-    *((name, "time") for name in LONG),
-    ("heptagon_impact", "margin"),
-    ("box_rolling", "effort"),
-    ("box_rolling", "margin"),
-]
+SLOW += [*((name, "time") for name in LONG), ("heptagon_impact", "margin")]
+SLOW += [("box_rolling", "effort"), ("box_rolling", "margin")]
 """Those that take long to plan and to look at; landings of the square for effort are left.
 
 `bench corpus` plans and verifies every problem and objective.

@@ -331,14 +331,14 @@ class Solver:
         count, *times = (
             stats.get(key, 0) for key in ("iter_count", "t_wall_total", "t_proc_total")
         )
-        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
-        sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
-        nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
-        run = IpoptRun(*sizes, *nonzeros, count, times[1])
-        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]), run)
+        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]))
         check()
         if stats["return_status"] == STOPPED:
             raise KeyboardInterrupt
+        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
+        sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
+        nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
+        book(SolverStatistics(), IpoptRun(*sizes, *nonzeros, count, times[1]))
         return result
 
     def stats(self) -> dict[str, Any]:
