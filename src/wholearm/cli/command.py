@@ -501,7 +501,8 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     if getattr(options, "json", False) or getattr(options, "list", ()):
         options.notes = {"notes": notes} if notes else {}
     else:
-        print(*(f"{note}\n" for note in notes), sep="", end="")
+        for note in notes:
+            print(note)
     return problem, plan, policy
 
 

@@ -184,14 +184,12 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     end_distance = EndDistance(formation.scene, until, z)
 
     panels: list[Panel] = []
+    first = np.zeros(len(formation.limits))  # limits below zero where the curve begins [rho]
 
     def margins(points: Array) -> Array:
         # Where a contact is gained is among the limits.
         left = end_distance.measure(points) if until.contact is None else np.ones(len(points))
-        values = formation.evaluate_limits(np.vstack([panels[0].z[:1], points])) / rho
-        # A plan ends at a crossing to its own tolerance: what is closed there counts from there.
-        # Case: phase 5 of `heptagon.toml` with periods of 5 ms, with v0-finger2 9e-10 below zero.
-        return np.column_stack([values[1:] - np.clip(values[0], -TOUCHING, 0.0), left])
+        return np.column_stack([formation.evaluate_limits(points) / rho - first, left])
 
     def end(s: float, text: str, reached: bool = False) -> Curve:
         return Curve(formation, tuple(panels), s, text, reached)
@@ -206,6 +204,11 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
                 return end(start, f"the contacts become dependent at {describe_pose(z)}")
             continue
         panels.append(panel)
+        if len(panels) == 1:
+            # A plan ends at a crossing to its own tolerance: what is closed there counts from
+            # there. Case: phase 5 of `heptagon.toml` with periods of 5 ms, v0-finger2 9e-10 below.
+            values = formation.evaluate_limits(panel.z[:1])[0] / rho
+            first = np.clip(values, -TOUCHING, 0.0)
         crossing = find_crossing(panel, margins)
         if crossing is not None:
             s, active = crossing

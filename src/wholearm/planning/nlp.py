@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import astuple, dataclass
+from functools import cached_property
 from operator import add
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -331,15 +332,20 @@ class Solver:
         count, *times = (
             stats.get(key, 0) for key in ("iter_count", "t_wall_total", "t_proc_total")
         )
-        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]))
+        stopped = stats["return_status"] == STOPPED
+        runs = [] if stopped else [IpoptRun(*self._sizes, count, times[1])]
+        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]), *runs)
         check()
-        if stats["return_status"] == STOPPED:
+        if stopped:
             raise KeyboardInterrupt
+        return result
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int, int, int]:
+        """Unknowns, rows, and nonzeros of Jacobian and Hessian, as in `IpoptRun`."""
         jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
         sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
-        nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
-        book(SolverStatistics(), IpoptRun(*sizes, *nonzeros, count, times[1]))
-        return result
+        return *sizes, jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
 
     def stats(self) -> dict[str, Any]:
         """Statistics of the last call."""

@@ -214,13 +214,23 @@ class Replay(Run):
         """A value that starts within rounding of zero has to fall below that."""
         return np.where(self.start > self.slack, 0.0, self.slack)
 
+    def observe(self) -> None:
+        """Evaluate the present state, and record it."""
+        self.look()
+        self.record()
+
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
         if self.v.any():
             self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
-        if not self.s.outputs.ratio[0] > 0:
-            self.fail_to_step(float(self.s.outputs.ratio[0]))
+        self.require_inertia()
+
+    def require_inertia(self) -> None:
+        """Raise a `JammingError` where friction leaves no reduced inertia."""
+        ratio = float(self.s.outputs.ratio[0])
+        if not ratio > 0:
+            self.fail_to_step(ratio)
 
     def fail_to_step(self, ratio: float) -> NoReturn:
         """Raise the error for a step size that underflows."""
@@ -638,8 +648,7 @@ class Replay(Run):
             gripped = (row for u in modes.list_units(formation) if u.grips for row in u.rows)
             self.stuck = {row for row in gripped if fixed[row]}
         self.take(mode, signs, departure.heading)
-        self.look()
-        self.record()
+        self.observe()
         return self.move()
 
     def go_on(self) -> Ending | None:
@@ -663,14 +672,12 @@ class Replay(Run):
         """
         if self._decide(turned, enters):
             return self.come_to_rest()
-        self.look()
-        self.record()
+        self.observe()
         ended, c_n = self._bridge(SETTLING), self.s.outputs.c_n
         # By more than rounding: phase 5 of leg 59 of seed 1128.
         if ended or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(BRIDGED)):
             return self.come_to_rest()
-        if not self.s.outputs.ratio[0] > 0:
-            self.fail_to_step(float(self.s.outputs.ratio[0]))
+        self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()
         reserves, holders = self._measure_reserves(), self.mode.holders
@@ -823,8 +830,7 @@ class Replay(Run):
             self.coast(self.t + float(self.s.inputs.h[0]))
         ended = self._decide(rows)
         if not ended:
-            self.look()
-            self.record()
+            self.observe()
         return ended
 
     def note_change(self, row: int, before: float, after: float) -> None:
