@@ -188,6 +188,7 @@ class Replay(Run):
         sizes = [rows.cone.stop, self.turning.stop - rows.cone.stop, count, 1, 1]
         # Of speeds 2e-13 is rounding.
         self.slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
+        self.has_one_freedom = mode.n_constraints >= 4
 
     def measure(self) -> Array:
         """Event values after the step just made, scaled.
@@ -201,13 +202,14 @@ class Replay(Run):
         ends.state[:] = out.y[:10]
         ends.evaluate()
         self.distance, self.rate = ends.values[-2:].tolist()
-        values, speed = out.values, 1.0
-        if self.mode.n_constraints >= 4:
+        speed = 1.0
+        if self.has_one_freedom:
             size = float(self.heading @ (self.system.mass * out.y[5:10]))
             speed = size / (scales.speed * scales.mass**0.5)
-        moving = values[: self.s.rows.slide.stop], values[-2:]
+        # Those of the coordinates of the object, between, are zero.
+        moving, turning = out.values[: self.s.rows.slide.stop], out.values[-2:]
         last = self.distance / ends.unit, speed
-        return np.concatenate([*moving, ends.values[:-2] / scales.length, last])
+        return np.concatenate([moving, turning, ends.values[:-2] / scales.length, last])
 
     @property
     def shift(self) -> Array:
@@ -222,8 +224,8 @@ class Replay(Run):
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        if self.v.any():
-            self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
+        if self.has_one_freedom and (v := self.v).any():
+            self.heading = v / math.sqrt(self.system.mass @ v**2)
         self.require_inertia()
 
     def require_inertia(self) -> None:
@@ -819,8 +821,10 @@ class Replay(Run):
                     break
             self.note(EventKind.TORQUE_STEP, "the torques step")
         else:
-            self.start = self.values
             stretch = min(window, self.stop - self.t)
+            if self._turns_later(stretch):
+                return False
+            self.start = self.values
             self.step_to(stretch)
             rows = self._find_turning(self.find_first(stretch, self.turning))
             if not rows:
@@ -832,6 +836,17 @@ class Replay(Run):
         if not ended:
             self.observe()
         return ended
+
+    def _turns_later(self, span: float) -> bool:
+        """Whether all that slides or turns is too fast to come to rest within a short time [s].
+
+        Accelerations relative to each other are at most ten times the largest of the coordinates.
+        """
+        out, time, units = self.s.outputs, self.system.scales.time, self.system.units[5:]
+        fastest = np.abs(out.y[5:10] / units).max()
+        strongest = np.abs(out.acceleration / units).max() * time
+        moving = self.values[self.turning][self.signs != 0]
+        return bool((moving > 10 * span / time * (strongest + fastest**2)).all())
 
     def note_change(self, row: int, before: float, after: float) -> None:
         """Record that a contact or joint sticks, slips or turns back."""
