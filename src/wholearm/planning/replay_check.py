@@ -17,7 +17,7 @@ from ..common.errors import InfeasibleError, JammingError, ReplayError, Simulati
 from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.dwell_record import assemble
-from ..results.report import LeastForce, ReplayedPhase, ReplayFigures, Report
+from ..results.report import RecordedDeviation, ReplayedPhase, ReplayFigures, Report
 from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
@@ -100,15 +100,13 @@ def replay_plan(
             )
         planning = better
     assert isinstance(check.report, Report)
-    least, number = check.report.least_force
+    phases = list[ReplayedPhase]()
+    for phase in check.report.phases:
+        far = (each and RecordedDeviation(*each) for each in (phase.end_deviation, phase.deviation))
+        phases.append(ReplayedPhase(phase.arrival, phase.end_speed, *far))
+    least, sizes = check.report.least_force, (check.residual.size, check.report.steps, simulations)
     assert least is not None
-    force = LeastForce(least.least, least.contact, number, least.time)
-    phases = tuple(
-        ReplayedPhase(phase.arrival, phase.end_speed, phase.end_deviation, phase.deviation)
-        for phase in check.report.phases
-    )
-    sizes = check.residual.size, check.report.steps, simulations
-    return planning, ReplayFigures(force, phases, *sizes)
+    return planning, ReplayFigures(least, tuple(phases), *sizes)
 
 
 def _improve(
