@@ -499,8 +499,8 @@ def test_a_table_that_loses_a_contact_is_an_error() -> None:
 def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     """The closer the samples, the nearer arrivals and forces are to those of the plan."""
     problem, trajectory = plan()
-    fine = replay_check.sample_table(problem, trajectory, 8000.0, interpolation).figures
-    coarse = replay_check.sample_table(problem, trajectory, 60.0, interpolation).figures
+    fine = replay_check.make_table(problem, trajectory, True, 8000.0, interpolation).figures
+    coarse = replay_check.make_table(problem, trajectory, True, 60.0, interpolation).figures
     assert (fine["sample_rate"], fine["interpolation"]) == (8000.0, interpolation)
     assert not coarse["replay"]["ok"] and " phase " in coarse["replay"]["reason"]
 
@@ -513,7 +513,7 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     # What is d off at its end arrives sqrt(2 d / a) early: half a period of delay takes 4 ms.
     assert (find_errors(fine) < [0.02, 0.02]).all()
     assert find_errors(coarse).sum() > 2 * find_errors(fine).sum()
-    unplayed = replay_check.sample_table(problem, trajectory, 60.0, interpolation, replay=False)
+    unplayed = replay_check.make_table(problem, trajectory, False, 60.0, interpolation)
     assert unplayed.figures["replay"] is None
 
 

@@ -161,8 +161,7 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         report = verify(problem, planned or torque)
     except (JammingError, SimulationError) as error:
         return replace(contender, reason=str(error))
-    least, number = report.least_force
-    energy, end = report.energy, report.phases[-1].arrival
+    least, energy, end = report.least_force, report.energy, report.phases[-1].arrival
     spans = [(phase.start, phase.arrival) for phase in report.phases]
     forces = [phase.least_force for phase in report.phases]
     return replace(
@@ -170,9 +169,9 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         ok=report.ok,
         reason=report.reason,
         duration=end if report.reached and end is not None else torque.duration,
-        margin=None if least is None else least.margin,
+        margin=None if least is None else least.value - report.epsilon,
         contact="" if least is None else least.contact,
-        phase=number,
+        phase=0 if least is None else least.phase,
         lost=energy.viscous + energy.dry + energy.contact + energy.impact,
         lasts=tuple(math.nan if t is None else t - start for start, t in spans),
         margins=tuple(math.nan if force is None else force.margin for force in forces),

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from ..benchmark.study import Study
     from ..common.document import Result
-    from ..planning.replay_check import TorqueTable
 
 
 TOPICS = {
@@ -508,6 +507,7 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
 
 def _solve(options: argparse.Namespace) -> int:
     from ..planning.plan import solve_with
+    from ..planning.replay_check import make_table
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
@@ -517,7 +517,8 @@ def _solve(options: argparse.Namespace) -> int:
     require_output(options.torques, ".csv")
     require_with(options, "sample_rate", "interpolation")
     require_with(options, "torques", "sample_rate")
-    choice("linear", "hold").read(options.interpolation or "linear", "interpolation")
+    interpolation = options.interpolation or "linear"
+    choice("linear", "hold").read(interpolation, "interpolation")
     problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
@@ -531,7 +532,8 @@ def _solve(options: argparse.Namespace) -> int:
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress, options.time_limit)
-        table = None if options.torques is None else _make_table(options, plan)
+        given = plan.problem, plan.trajectory, options.replay, options.sample_rate, interpolation
+        table = None if options.torques is None else make_table(*given)
     except WholearmError as error:
         # Of bad input one line says everything.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
@@ -550,17 +552,6 @@ def _solve(options: argparse.Namespace) -> int:
     else:
         print(route_text + describe_plan(plan, output, figures).to_text())
     return 0
-
-
-def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
-    """The torque table of a plan."""
-    from ..planning import replay_check
-
-    given = plan.problem, plan.trajectory
-    if options.sample_rate is None:
-        return replay_check.make_table(*given, options.replay)
-    sampling = options.sample_rate, options.interpolation or "linear"
-    return replay_check.sample_table(*given, *sampling, options.replay)
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -261,7 +261,7 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
             place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
             text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        uniqueness.append((margin, find_wedged(problem, phase, trajectory, rows, EXACT_REST)))
+        uniqueness.append((margin, find_wedged(problem, phase, trajectory, EXACT_REST)))
     return uniqueness
 
 

@@ -17,7 +17,7 @@ from ..common.errors import InfeasibleError, JammingError, ReplayError, Simulati
 from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.dwell_record import assemble
-from ..results.report import LeastForce, ReplayedPhase, ReplayFigures, Report
+from ..results.report import RecordedDeviation, ReplayedPhase, ReplayFigures, Report
 from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
@@ -100,15 +100,13 @@ def replay_plan(
             )
         planning = better
     assert isinstance(check.report, Report)
-    least, number = check.report.least_force
+    phases = list[ReplayedPhase]()
+    for phase in check.report.phases:
+        far = (each and RecordedDeviation(*each) for each in (phase.end_deviation, phase.deviation))
+        phases.append(ReplayedPhase(phase.arrival, phase.end_speed, *far))
+    least, sizes = check.report.least_force, (check.residual.size, check.report.steps, simulations)
     assert least is not None
-    force = LeastForce(least.least, least.contact, number, least.time)
-    phases = tuple(
-        ReplayedPhase(phase.arrival, phase.end_speed, phase.end_deviation, phase.deviation)
-        for phase in check.report.phases
-    )
-    sizes = check.residual.size, check.report.steps, simulations
-    return planning, ReplayFigures(force, phases, *sizes)
+    return planning, ReplayFigures(least, tuple(phases), *sizes)
 
 
 def _improve(
@@ -209,27 +207,43 @@ class TorqueTable(NamedTuple):
         write_text(path, format_rows(self.rows, self.commands))
 
 
-def _tabulate(
+def make_table(
     problem: Problem,
     trajectory: Trajectory,
-    rows: Array,
-    replay: dict[str, Any] | None,
-    **figures: Any,
+    replay: bool = True,
+    rate: float | None = None,
+    interpolation: str = "linear",
 ) -> TorqueTable:
-    """The table of rows with the commands of motors that lag, and the figures of its replay."""
-    lag = problem.scene.actuator_lag
-    commands = find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
-    return TorqueTable(rows, {"rows": len(rows), **figures, "replay": replay}, commands)
+    """A plan's torques in rows as dense as a simulation of them needs to hold, and their replay.
 
-
-def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> TorqueTable:
-    """Rows as dense as a simulation of them needs to hold.
+    Samples at a `rate` [Hz] are replayed as they are; their failure is no error.
 
     Raises
     ------
     ReplayError                    if the replay loses a contact or misses the goal with any rows
     JammingError, SimulationError  if the simulation cannot go on
     """
+    sampling: dict[str, Any] = {}
+    if rate is None:
+        rows, compared = _find_rows(problem, trajectory, replay)
+    else:
+        sampling = {"sample_rate": rate, "interpolation": interpolation}
+        rows, compared = sample_rows(trajectory.torque, rate, interpolation), None
+        if replay:
+            try:
+                simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
+                compared = _compare(trajectory, judge(simulation, None, Allowance()))
+            except (JammingError, SimulationError) as error:
+                compared = {"ok": False, "reason": str(error), "phases": []}
+    lag = problem.scene.actuator_lag
+    commands = find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
+    return TorqueTable(rows, {"rows": len(rows), **sampling, "replay": compared}, commands)
+
+
+def _find_rows(
+    problem: Problem, trajectory: Trajectory, replay: bool
+) -> tuple[Array, dict[str, Any] | None]:
+    """Rows that a simulation of them holds with, and its figures; None without a `replay`."""
     rate_limit = problem.scene.torque_rate_limit if problem.scene.has_slow_motors else None
     least, error = ERROR / _FINER ** (_ATTEMPTS - 1), ERROR
     rows = place_rows(trajectory.torque, error, rate_limit)
@@ -238,7 +252,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
         error /= 2
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
-        return _tabulate(problem, trajectory, rows, None)
+        return rows, None
     for _ in range(_ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
         simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
@@ -254,23 +268,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
             f"the torques as a table of {len(rows)} rows do not hold in their replay: "
             f"{report.reason}; --no-replay (replay=False) leaves the check out"
         )
-    return _tabulate(problem, trajectory, rows, _compare(trajectory, report))
-
-
-def sample_table(
-    problem: Problem, trajectory: Trajectory, rate: float, interpolation: str, replay: bool = True
-) -> TorqueTable:
-    """Samples of a plan's torques at a rate [Hz], and their replay, whose failure is no error."""
-    rows = sample_rows(trajectory.torque, rate, interpolation)
-    compared: dict[str, Any] | None = None
-    if replay:
-        try:
-            simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
-            compared = _compare(trajectory, judge(simulation, None, Allowance()))
-        except (JammingError, SimulationError) as error:
-            compared = {"ok": False, "reason": str(error), "phases": []}
-    sampling = {"sample_rate": rate, "interpolation": interpolation}
-    return _tabulate(problem, trajectory, rows, compared, **sampling)
+    return rows, _compare(trajectory, report)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:

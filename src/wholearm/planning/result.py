@@ -37,9 +37,6 @@ _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ra
 """Options that stand in `meta` by themselves."""
 
 
-_DEVIATIONS = ("end_deviation", "deviation")  # keys of a replayed phase
-
-
 class Status(Enum):
     """How planning has ended."""
 
@@ -197,12 +194,6 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "ranges": plan.ranges,
         }
     )
-    # Deviations have the names of their units in files.
-    for phase in values["replay"]["phases"] if plan.replay else ():
-        for key in _DEVIATIONS:
-            phase[key] = phase[key] and dict(
-                zip(("m", "rad", "s"), phase[key].values(), strict=True)
-            )
     return values | {"problem": plan.problem.table}
 
 
@@ -222,22 +213,6 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"does not describe a plan: {type(error).__name__} {error}"
         raise InputError(source, "meta", what) from None
-
-
-def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
-    """The replay, whose deviations have the names of their units in files."""
-
-    def rename(key: str, entry: Any) -> Any:
-        if key not in _DEVIATIONS or entry is None:
-            return entry
-        # Files of earlier versions do not say when.
-        return {"position": entry["m"], "angle": entry["rad"], "time": entry.get("s")}
-
-    # In earlier versions intervals were doubled for a replay to hold.
-    entries = {key: value for key, value in given.items() if key != "refinements"}
-    phases = [{key: rename(key, phase[key]) for key in phase} for phase in given["phases"]]
-    figures: ReplayFigures = restore(ReplayFigures, entries | {"phases": phases})
-    return figures
 
 
 def _read(trajectory: Trajectory, problem: Problem) -> Plan:
@@ -262,7 +237,10 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     phases = restore(tuple[PlannedPhase, ...], numbered)
     status, replay, spent = Status(meta["status"]), meta.get("replay"), meta.get("timings", {})
     transitions = restore(tuple[Transition, ...], meta.get("transitions", ()))
-    figures = None if replay is None else _read_replay(replay)
+    if replay is not None:
+        # In earlier versions intervals were doubled for a replay to hold.
+        replay = {key: value for key, value in replay.items() if key != "refinements"}
+    figures = restore(ReplayFigures | None, replay)
     timings = Timings(*(float(spent.get(name, 0.0)) for name in Timings._fields))
     plan = problem, options, status, float(meta["value"]), trajectory, phases, transitions, figures
     certificate = restore(Certificate | None, meta.get("certificate"))
@@ -371,8 +349,8 @@ def _describe_replay(plan: Plan) -> str:
     return (
         f"replayed: least c_n {least.value:{fixed(epsilon or 0.05, 5)}} N on "
         f"{least.contact}{below}, off by at most "
-        f"{max((end.position for end in ends), default=0.0):.1e} m and "
-        f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
+        f"{max((end.m for end in ends), default=0.0):.1e} m and "
+        f"{max((end.rad for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
 
 

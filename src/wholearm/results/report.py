@@ -297,10 +297,11 @@ class Report(Result):
         return self.failures[0] if self.failures else self.outcome
 
     @property
-    def least_force(self) -> tuple[ContactMargin | None, int]:
-        """The contact with the least normal force, and the number of its phase, if any moved."""
-        pairs = [(one, phase.number) for phase in self.phases if (one := phase.least_force)]
-        return min(pairs, key=lambda pair: pair[0].least, default=(None, 0))
+    def least_force(self) -> LeastForce | None:
+        """The least normal force of all phases; None if nothing moved."""
+        least = [(one, phase.number) for phase in self.phases if (one := phase.least_force)]
+        forces = (LeastForce(one.least, one.contact, phase, one.time) for one, phase in least)
+        return min(forces, key=lambda force: force.value, default=None)
 
     @property
     def document(self) -> Document:
@@ -447,14 +448,22 @@ class LeastForce(NamedTuple):
     time: float
 
 
+class RecordedDeviation(NamedTuple):
+    """A `Deviation`, whose position, angle and time have the names of their units in files."""
+
+    m: float
+    rad: float
+    s: float = math.nan  # files of earlier versions do not say when
+
+
 class ReplayedPhase(NamedTuple):
     """One phase of the replay."""
 
     arrival: float | None  # [s]: when its end was reached
     end_speed: float | None  # [m/s]: what is left at an end at rest
     # end_deviation, deviation: from the plan, at the end of the phase and at worst
-    end_deviation: Deviation | None
-    deviation: Deviation | None
+    end_deviation: RecordedDeviation | None
+    deviation: RecordedDeviation | None
 
 
 class ReplayFigures(NamedTuple):

@@ -261,7 +261,7 @@ def _report_phase(
         starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
         breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
         since = max(breaks, default=-math.inf)
-        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, since)
+        held = find_wedged(problem, phase, simulation, REST_SPEED, since)
         least = find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
         end, worst = _compare(simulation, plan, phase, bool(arrivals))
@@ -560,12 +560,7 @@ def find_uniqueness_margin(
 
 
 def find_wedged(
-    problem: Problem,
-    phase: Phase,
-    motion: Trajectory | Simulation,
-    rows: Numbers,
-    slow: float,
-    start: float = -np.inf,
+    problem: Problem, phase: Phase, motion: Trajectory | Simulation, slow: float, start: float = 0.0
 ) -> float | None:
     """Time for which friction may hold a phase that begins at rest (static indeterminacy) [s].
 
@@ -574,12 +569,12 @@ def find_wedged(
 
     Parameters
     ----------
-    rows         its rows in the phase
     slow         speed that passes for rest, relative to the scene's
     start : [s]  since when the phase is to move, if its rows begin with the time for which it is
                  held
     """
     scene, contacts = problem.scene, phase.formation.contacts
+    rows = np.flatnonzero(motion.phase == phase.index)
     if phase.index:
         if measure_speed(scene, motion.z_dot[rows[0]]) > slow * scene.scales.speed:
             return None
@@ -714,12 +709,12 @@ def _examine_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        paths = list(modes.find_rest(formation, z).list_modes())
-        free = [path for path in paths if path.slides(tau)]
+        rest = modes.find_rest(formation, z)
+        free = [path for path in rest.list_modes() if path.slides(tau)]
         worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
         response = None if worst is None else worst.response
         gradient = None if distance is None else distance[1][0]
-        changes = find_resting_changes(formation, paths, epsilon, z, tau, gradient)
+        changes = find_resting_changes(rest, epsilon, tau, gradient)
     else:
         response = find_moving(formation, z, v, tau, simulation.z_ddot[row])
         changes = () if response is None else list_changes(response, v, epsilon, contact, tau)
@@ -804,12 +799,7 @@ def find_approach(simulation: Simulation) -> results.Approach | None:
 
 
 def find_resting_changes(
-    formation: Formation,
-    paths: Sequence[modes.StartMode],
-    epsilon: float,
-    z: Array,
-    tau: Array,
-    gradient: Array | None,
+    rest: modes.Rest, epsilon: float, tau: Array, gradient: Array | None
 ) -> tuple[results.TorqueAdvice, ...]:
     """Least changes of each torque alone, or else of both, that let it keep its contacts.
 
@@ -817,15 +807,13 @@ def find_resting_changes(
 
     Parameters
     ----------
-    paths             directions in which the formation could begin to move
     epsilon : [N]
-    z : (5,)
     tau : (2,) [N m]
     gradient : (5,)   of the distance to the end of the phase, if that is known
     """
-    limits, unit = make_limits(formation, epsilon), formation.scene.scales.torque
+    limits, unit = make_limits(rest.formation, epsilon), rest.formation.scene.scales.torque
     starts = list[tuple[modes.StartMode, tuple[Array, Array]]]()
-    for path in paths:
+    for path in rest.list_modes():
         towards = [] if gradient is None else [-gradient @ path.response.acceleration]
         rows = np.vstack([path.margins, *towards])
         sizes = np.abs(rows) @ [1.0, unit, unit]
@@ -839,7 +827,7 @@ def find_resting_changes(
         solutions = ((path, find_least_change(*sides, free)) for path, sides in starts)
         least = [(path, unit * one) for path, one in solutions if one is not None]
         moved = [change for path, change in least if path.moves(tau + change)]
-        held = None if moved else Statics(formation, z).find_holding_change(tau, epsilon, free)
+        held = None if moved else rest.statics.find_holding_change(tau, epsilon, free)
         if moved:
             changes.append(make_advice(min(moved, key=np.linalg.norm), tau))
         elif held is not None:

@@ -223,9 +223,9 @@ def write_gallery(
         write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
         report = verify(plan.problem, plan)
         gap = "" if report.finger_gap is None else report.finger_gap.least
-        least, _ = report.least_force
+        least = report.least_force
         verdict = "ok" if report.ok else "FAILED"
-        rows.append((name, len(plan.phases), plan.value, least and least.least, gap, verdict))
+        rows.append((name, len(plan.phases), plan.value, least and least.value, gap, verdict))
         place = f"{os.path.basename(folder)}/{name}"
         links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
         pictures.append(f"## {plan.problem.name}\n\n{links}")
