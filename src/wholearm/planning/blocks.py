@@ -111,11 +111,6 @@ class Planning:
         """Longest duration of some phases in all [s], for the objective `margin`."""
         return sum(self.allowed[phase.index] for phase in phases) if self.allowed else None
 
-    def find_before(self, phases: Sequence[Phase]) -> BlockPlan | None:
-        """The planned block that ends where some phases begin."""
-        index = phases[0].index
-        return next((block for block in self.blocks if block.phases[-1].index + 1 == index), None)
-
 
 def plan_blocks(
     problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
@@ -291,13 +286,14 @@ def plan_with_pauses(
     """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
     from .dwell import add_pause
 
-    block_before, scene = planning.find_before(block), planning.problem.scene
+    before, scene = planning.plans[-1:], planning.problem.scene
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
         """From the torques before each phase to its first ones."""
-        before = block_before.plans[-1].end_torques[1] if block_before else plans[0].end_torques[0]
-        pairs = zip([before, *(plan.end_torques[1] for plan in plans[:-1])], plans, strict=True)
-        return [change_torques(scene, last, plan.end_torques[0]) for last, plan in pairs]
+        lasts = [plan.end_torques[1] for plan in [*before, *plans[:-1]]]
+        firsts = [plan.end_torques[0] for plan in plans]
+        lasts = lasts if before else [firsts[0], *lasts]
+        return [change_torques(scene, *pair) for pair in zip(lasts, firsts, strict=True)]
 
     plans = plan(duration)
     changes = list_changes(plans)
@@ -517,11 +513,10 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
     more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
     first_epsilon, last_epsilon = (epsilon + max(other - more[1], 0.0) for other in more[::2])
-    block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
-    if block_before is not None:
-        chain, last_plan = block_before.chain, block_before.plans[-1]
-        before = chain.curves[-1] if chain else last_plan.end_torques[1]
+    if planning.blocks:
+        chain, plans_before = planning.blocks[-1].chain, planning.blocks[-1].plans
+        before = chain.curves[-1] if chain else plans_before[-1].end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     beyond: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):

@@ -268,10 +268,11 @@ class Task:
             return _RATE if self.is_held else few
         return max(-(-self.options.intervals // DEGREE), 3)
 
-    def lay_out(self, breaks: Sequence[Array], elements: int) -> list[PhaseData]:
+    def lay_out(self, elements: int = 0, breaks: Sequence[Array] = ()) -> list[PhaseData]:
         """Each phase on elements with breaks: as many as wanted, if that is enough for these."""
-        pairs, last = list(zip(self.curves, breaks, strict=True)), len(breaks) - 1
-        elements = max(elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
+        breaks, last = breaks or [np.zeros(0)] * len(self.curves), len(self.curves) - 1
+        pairs = list(zip(self.curves, breaks, strict=True))
+        elements = max(elements or self.elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
         grids = [
             make_grid(*pair, elements, (k == 0, k == last), self.is_held)
             for k, pair in enumerate(pairs)
@@ -284,7 +285,7 @@ class Task:
 
     def find_fastest(self) -> Fastest | None:
         """The minimum-time speed profile of a sweep; None without one."""
-        return find_fastest(join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements)))
+        return find_fastest(join(self.lay_out()))
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
@@ -330,9 +331,7 @@ class PathIterate:
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
         """Start from the minimum-time speed profile, or a parabola of the squared speed."""
-        breaks = [np.zeros(0)] * len(task.curves)
-        parts = task.lay_out(breaks, elements)
-        data = join(parts)
+        data, breaks = join(parts := task.lay_out(elements)), [np.zeros(0)] * len(task.curves)
         profile, units = guess(data, task.options.time_weight)
         swept = task.options.goal is Objective.TIME and not task.is_held
         if swept and (fastest := find_fastest(data)):
@@ -343,7 +342,7 @@ class PathIterate:
                 on_curve = keep_apart(curve, fastest.switches[owner == k] - starts[k])
                 if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
                     breaks[k] = on_curve
-            parts = task.lay_out(breaks, elements)
+            parts = task.lay_out(elements, breaks)
             profile = guess_below(join(parts), fastest)
         return PathIterate.on(task, parts, units, profile, 0.0)
 
@@ -369,7 +368,7 @@ class PathIterate:
     @staticmethod
     def elastic(task: Task) -> PathIterate:
         """The problem with soft limits, from a slow motion whatever they are."""
-        data = join(parts := task.lay_out([np.zeros(0)] * len(task.curves), task.elements))
+        data = join(parts := task.lay_out())
         profile, units = _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
         # A shortfall of torque is as bad as one of force.
         torque = np.full(2, 15.0 * data.curve.formation.scene.scales.torque)
@@ -442,7 +441,7 @@ class PathIterate:
             "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
             "torque": data.nodes.forces.of_tau[..., ONE] / torque,
             "joints": torque**2 / units.power,
-            "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
+            "quick": (torque / units.time / scene.torque_rate_limit)[list(shape.rates)],
             "lags": scene.actuator_lag[list(shape.commands)] / units.time,
             "maps": data.grid.maps,
             "sizes": data.grid.sizes,
@@ -554,7 +553,7 @@ class PathIterate:
         """Start on at least so many other elements, with these breaks, from this motion."""
         every, held = zip(self.task.curves, breaks, strict=True), self.task.is_held
         ends = [keep_apart(curve, places, held) for curve, places in every]
-        parts = self.task.lay_out(ends, elements)
+        parts = self.task.lay_out(elements, ends)
         grid = join(parts).grid
         profile = Elements(self.data.grid, self.profile).move(grid)
         if grid.held:
@@ -607,8 +606,8 @@ class PathIterate:
         short, over[:, 0] = data.misses(profile, self.margin)
         if data.grid.held:
             torques, rates = find_torques(data, profile, self.motions)
-            rate = np.abs(rates).max(axis=2) / data.rate_limit
-            lags = data.curve.formation.scene.actuator_lag
+            scene = data.curve.formation.scene
+            rate, lags = np.abs(rates).max(axis=2) / scene.torque_rate_limit, scene.actuator_lag
             command = np.abs(torques + lags[:, None] * rates).max(axis=2) / data.torque_limit
             over[:, 1:] = np.maximum(np.hstack([rate, command * (lags > 0)]) - 1, 0.0)
         return short, over, late

@@ -52,7 +52,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, make_scheme, resample, to_si, unit_of, with_controls
+from .stage import Scheme, Stage, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def plan_phases(
     """
     from ..explain import change_limit, refuse
 
-    search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
+    search = TimeSearch(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
     solution: TimeSolution | None = None
     if begun:
@@ -202,9 +202,10 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
         """Whether there is a solution with motors so many times as quick, from the last one."""
         nonlocal stages
         tried.append(factor)
-        scene = search.problem.scene.quicken(factor)
-        quick = replace(search, problem=replace(search.problem, scene=scene))
-        solution = quick.solve(link([stage.move_to(scene) for stage in stages]), most=most)
+        scene = search.source.scene.quicken(factor)
+        quick = replace(search, source=replace(search.source, scene=scene))
+        moved = link([stage.move_to(quick.problem.scene) for stage in stages])
+        solution = quick.solve(moved, most=most)
         if solution.success:
             plans.append((factor, quick, solution))
             stages = solution.stages
@@ -266,7 +267,7 @@ def try_phases(
     stopped       plans of the phases, each from rest to rest, as the only guess
     """
     rough = replace(options, mode_search=False)
-    search = TimeSearch.of(problem, rough, phases, only_begins=True)
+    search = TimeSearch(problem, rough, phases, only_begins=True)
     guesses = Guesses(search, z)
     listed: Iterable[Guess] = guesses.every(goal)
     if stopped:
@@ -405,9 +406,9 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
     """
     from ..explain import refuse_motors
 
-    scene, options = search.problem.scene, search.options
+    scene = search.problem.scene
     controls = 2 if scene.control_hold == "linear" else 1
-    held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
+    held = replace(search, controls=controls)
 
     def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
         # Phases 2 to 4 of a pentagon take 70 at 2 ms. More than from a guess, so that a solve that
@@ -573,8 +574,7 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         return
     free = tuple(replace(p, until=replace(p.until, pins=())) for p in search.source.phases)
     problem, phases = replace(search.source, phases=free), [free[p.index] for p in search.phases]
-    given = search.options, phases, search.duration, None, search.ample, True
-    free_search = replace(TimeSearch.of(problem, *given), tried=search.tried)
+    free_search = replace(search, source=problem, phases=phases, to_go=None, only_begins=True)
     coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
     if coarse is None:
         return
@@ -590,7 +590,7 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
     short, missed = list[list[Stage]](), list[Shortfall]()
-    soft = search.aiming(Objective.ELASTIC)
+    soft = search.soften()
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
         elastic = soft.solve(guess.stages)
         missed = list_shortfalls(search, elastic.stages)
