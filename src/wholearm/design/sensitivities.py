@@ -161,8 +161,8 @@ def _evaluate_path(
         segment = grid.segment[:: path_motion.NODES]
         moved = path_motion.lay_out(edges, segment, (k == 0, k == last), task.is_held)
         parts.append(path_data.prepare(curve, epsilon, moved, phase))
-    data = path_data.join(parts)
-    other = replace(iterate, data=data)
+    other = replace(iterate, parts=parts)
+    data = other.data
     x, p, bounds = iterate.pack(), other.find_parameters(), other.make_bounds()
     f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
     of_x = _charge(iterate.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])

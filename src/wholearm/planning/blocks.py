@@ -180,8 +180,7 @@ def plan_next(
                     replace(planning, problem=pressed),
                     phases,
                     z,
-                    options,
-                    to_go=look_ahead(planning, phases, options) if planning.ahead else None,
+                    to_go=look_ahead(planning, phases) if planning.ahead else None,
                     ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                     fastest=[least[phase.index] for phase in phases if least],
                     begun=known.plans if known and known.coarse else (),
@@ -209,18 +208,18 @@ def _replay(planning: Planning) -> Array:
 
 
 def plan_block(
-    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
+    planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves.
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    problem = planning.problem
+    problem, options = planning.problem, planning.options
     if not runs_along_curves(block, options):
-        return _plan_over_time(planning, block, z, options, over_time), None
+        return _plan_over_time(planning, block, z, over_time), None
     chain = trace_block(planning, block, z)
     if problem.scene.has_slow_motors:
-        return plan_slowly(planning, chain, options), chain
+        return plan_slowly(planning, chain), chain
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
@@ -240,11 +239,7 @@ def trace_block(planning: Planning, block: Sequence[Phase], z: Array) -> ImpactS
 
 
 def _plan_over_time(
-    planning: Planning,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-    over_time: dict[str, Any],
+    planning: Planning, block: Sequence[Phase], z: Array, over_time: dict[str, Any]
 ) -> Plans:
     """Plans of a block in the time domain, from those with free torques if these are limited.
 
@@ -253,14 +248,14 @@ def _plan_over_time(
     """
     from .time_domain.time_plan import plan_with_impacts
 
-    problem, failure = planning.problem, None
+    problem, options, failure = planning.problem, planning.options, None
     slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
     # Coarse plans of the edges of routes are of free torques, others of those of the block.
     coarse, begun = over_time.get("only_begin", False), over_time.pop("begun", ())
     of_free, of_block = (begun, ()) if slow and coarse else ((), begun)
     for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-        free_options = replace(options, mode_search=complete)
-        free = plan_free(planning, block, z, free_options, begun=of_free, **over_time)
+        first = replace(planning, options=replace(options, mode_search=complete))
+        free = plan_free(first, block, z, begun=of_free, **over_time)
         plan: Callable[[float | None], Plans] = partial(
             plan_with_impacts, problem, block, z, options, free=free, begun=of_block, **over_time
         )
@@ -307,25 +302,24 @@ def plan_with_pauses(
     ]
 
 
-def plan_free(
-    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
-) -> Plans:
+def plan_free(planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any) -> Plans:
     """Plans of a block over time as it would be planned with free torques, maybe along its curves.
 
     None if it is planned so anyway, or asked for over time without a plan along curves.
     """
-    problem, free_options = free_torques(planning.problem, replace(options, transcription="auto"))
+    problem, options = free_torques(planning.problem, planning.options)
+    options = replace(options, transcription="auto")
     phases = [problem.phases[phase.index] for phase in block]
     freed = problem is not planning.problem
-    if not (freed or runs_along_curves(phases, free_options)):
+    if not (freed or runs_along_curves(phases, options)):
         return []
     over_time |= {"fastest": ()}
     if not planning.problem.scene.control_period:
         # What holding costs is the difference to an accurate plan.
-        over_time["only_begin"], free_options = True, free_options.roughen()
+        over_time["only_begin"], options = True, options.roughen()
     try:
-        free = replace(planning, problem=problem, curves=())
-        return plan_block(free, phases, z, free_options, **over_time)[0]
+        free = replace(planning, problem=problem, options=options, curves=())
+        return plan_block(free, phases, z, **over_time)[0]
     except WholearmError as error:
         if not freed:
             return []
@@ -340,13 +334,14 @@ def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:
     return next((other for other in split_blocks(problem) if other[0].index == index), ())
 
 
-def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
+def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
     """Cost-to-go of a block in the time domain with a free end on a curve.
 
     Without limits of motors: its gradient is nearly the same, and soon known.
     """
-    problem, options = free_torques(planning.problem, options)
-    planning, following = replace(planning, problem=problem), find_following(problem, block)
+    problem, options = free_torques(planning.problem, planning.options)
+    planning = replace(planning, problem=problem, options=options)
+    following = find_following(problem, block)
     if runs_along_curves(block, options) or not following:
         return None
     phase, ending = following[0], block[-1]
@@ -365,7 +360,7 @@ def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions)
         return estimate_time_to_go(phase, problem.epsilon)
 
     def value(z: Array) -> float:
-        return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
+        return sum(plan.value for plan in plan_block(planning, following, z)[0])
 
     return CostToGo(phase, value)
 
@@ -502,14 +497,14 @@ class ImpactSequence:
         return impacts
 
 
-def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptions) -> Plans:
+def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
     """Plan the parts of a block along curves under rate limits, with pauses between them.
 
     Torques change in pauses from those of the block before, and to those of the next one.
     """
     from .dwell import Junction, add_pause, choose_junction
 
-    epsilon, parts = planning.problem.epsilon, sequence.split()
+    epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
     # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
     more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
     first_epsilon, last_epsilon = (epsilon + max(other - more[1], 0.0) for other in more[::2])

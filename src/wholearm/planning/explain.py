@@ -8,8 +8,8 @@ plan: only what was planned is advised.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -44,7 +44,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
-from .nlp import open_ledger
+from .nlp import open_ledger, setting
 from .options import PlanOptions
 from .path_domain.path_data import fit_torque
 from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
@@ -62,14 +62,9 @@ Replan = Callable[[Parameter, float], object]  # plans with another value of a p
 E = TypeVar("E", InfeasibleError, JammingError)
 
 
-@contextmanager
-def unadvised() -> Iterator[None]:
+def unadvised() -> AbstractContextManager[None]:
     """Have errors say what is missing without looking for changes that would help."""
-    token = _unadvised.set(True)
-    try:
-        yield
-    finally:
-        _unadvised.reset(token)
+    return setting(_unadvised, True)
 
 
 def advise(

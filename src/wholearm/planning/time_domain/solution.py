@@ -253,18 +253,17 @@ class TimeSearch:
         x0 = pack([stage.guess for stage in stages], nlp.layouts, margin)
         bounds = {"lbx": low, "ubx": high, "lbg": low_g, "ubg": high_g}
         result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
-        if near and not solver.stats()["success"]:
+        if near and not result["success"]:
             solver = nlp.make_solver(1e-2, **MONOTONE)
             result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
-        stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(price.gradient @ price.origin)
         pairs = zip(stages, unpack(x, nlp.layouts), strict=True)
         solved = [replace(stage, guess=part) for stage, part in pairs]
         multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        status = f"Ipopt stopped with {stats['return_status']}"
+        status = f"Ipopt stopped with {result['status']}"
         margin = -cost if self.goal is Objective.MARGIN else 0.0
-        return TimeSolution(solved, cost, margin, status, stats["success"], nlp, multipliers)
+        return TimeSolution(solved, cost, margin, status, result["success"], nlp, multipliers)
 
 
 @dataclass(frozen=True)
@@ -322,14 +321,13 @@ class TimeIterate:
     stages: list[Stage]
     raised: list[LimitMisses]  # limits of the stages, by these amounts
     highest: float  # cost above which refinement ends
-    is_solved: bool = True
     change: float = 0.01  # of the cost by the last finer intervals, relative; at first a guess
     least: float = math.nan  # cost of the first solution on these intervals
     refined: int = 0  # iterates with finer intervals so far
 
     def solve(self) -> TimeIterate:
         """The solution on these stages."""
-        if self.is_solved:
+        if self.stages is self.solution.stages:
             return self
         most = SETTINGS.patience * (2 if self.search.problem.scene.has_slow_motors else 1)
         solution = self.search.solve(self.stages, self.solution, most, self.raised)
@@ -344,7 +342,7 @@ class TimeIterate:
             change = abs(solution.cost - old.cost) / self.search.measure(solution.cost)
             least = solution.cost
         solved = replace(self, solution=solution, stages=solution.stages, change=change)
-        return replace(solved, least=least, is_solved=True)
+        return replace(solved, least=least)
 
     def adapt(self) -> TimeIterate | None:
         """With finer intervals, raised limits and those of the formation that are violated."""
@@ -354,7 +352,7 @@ class TimeIterate:
         triples = zip(self.raised, self.misses, self.halvings, strict=True)
         raised = [limits.add(miss, SETTINGS.over).halve(mine) for limits, miss, mine in triples]
         refined = self.refined + self.is_coarse
-        return replace(self, stages=stages, raised=raised, is_solved=False, refined=refined)
+        return replace(self, stages=stages, raised=raised, refined=refined)
 
     def restart(self) -> None:
         """Without a solution there is no other iterate."""

@@ -52,7 +52,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, resample, to_si, unit_of, with_controls
+from .stage import Scheme, Stage, resample, to_si, unit_of
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -478,11 +478,7 @@ def count_periods(stages: Sequence[Stage], period: float) -> list[int]:
 
 
 def cut_periods(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    period: float,
-    stretch: float = 1.0,
-    equal: bool = False,
+    stages: Sequence[Stage], scheme: Scheme, period: float, stretch: float, equal: bool
 ) -> list[Stage]:
     """Stages whose intervals are periods or parts of them, stretched in time.
 
@@ -502,8 +498,7 @@ def cut_periods(
             edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
             numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
             part = resample(stage.guess, scheme, (edges - start) / (stop - start))
-            longer = replace(stage, guess=with_controls(part, scheme.controls))
-            longer = longer.stretch((stop - start) / stage.guess.duration)
+            longer = replace(stage, guess=part).stretch((stop - start) / stage.guess.duration)
             cut.append(replace(longer, periods=numbers, period=0.0 if equal else period))
             start = stop
     return cut
