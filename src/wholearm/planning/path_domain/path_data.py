@@ -7,7 +7,7 @@ through the knots give them where limits are checked.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,8 @@ from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
+from ..robust.robust_rows import RobustLimits, spread_limits
 from .path_motion import Elements, Grid, PathMotion, Profile
-
-if TYPE_CHECKING:
-    from ..robust.robust_rows import RobustLimits
 
 PLACES = 13  # interpolation points where torques of a motion are not those through the knots
 LOOKS = 21  # samples of torque rates in each interval
@@ -179,8 +177,6 @@ def prepare(
     nodes, checks = every.pick(slice(None, len(grid.s))), Places(*map(interpolate, knots))
     limits = make_limits(formation, epsilon)
     if spread is not None:
-        from ..robust.robust_rows import spread_limits
-
         limits = spread_limits(limits)
         inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))

@@ -33,7 +33,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -49,6 +49,7 @@ from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
+from ..robust.robust_rows import Guide, RobustLimits, list_holds, measure_holds, spread
 from .path_data import PhaseData, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
@@ -60,9 +61,6 @@ from .path_mesh import (
     make_grid,
 )
 from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basis, follow, list_maps
-
-if TYPE_CHECKING:
-    from ..robust.robust_rows import Guide, RobustLimits
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
@@ -187,8 +185,6 @@ def find_sure_start(
     margin : [N]  of normal forces over epsilon
     ranges        of parameters, within all of which it has to leave rest
     """
-    from ..robust.robust_rows import list_holds, measure_holds
-
     formation, forces = data.curve.formation, data.nodes.forces
     holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.lam[0]])
@@ -250,8 +246,6 @@ class Task:
         """Robust force limits of each curve, None without ranges."""
         if not self.guides:
             return [None] * len(self.curves)
-        from ..robust.robust_rows import spread
-
         args = self.epsilon, self.options.ranges
         return [spread(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
 
@@ -594,8 +588,6 @@ class PathIterate:
     @property
     def guides(self) -> tuple[Guide, ...]:
         """The motion along each curve as a reference."""
-        from ..robust.robust_rows import Guide
-
         return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property

@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, islice, pairwise, takewhile
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +35,16 @@ from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase, Problem
 from ...results.report import Transition
 from ...results.trajectory import Motion
+from ..explain import (
+    Replan,
+    change_limit,
+    explain_stages,
+    list_shortfalls,
+    refuse,
+    refuse_motors,
+    refuse_paths,
+    require_hold_at_ends,
+)
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops
 from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
@@ -54,9 +64,6 @@ from .mode_search import (
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
 from .stage import Scheme, Stage, resample, to_si, unit_of
 from .time_motion import TimeMotion, make_phase_motions
-
-if TYPE_CHECKING:
-    from ..explain import Replan
 
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
 # a pentagon, 0.369 s from the modes of a plan of 0.094 s (the test of given modes)
@@ -101,8 +108,6 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    from ..explain import change_limit, refuse
-
     search = TimeSearch(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
     solution: TimeSolution | None = None
@@ -192,8 +197,6 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     ------
     InfeasibleError  if that does not lead to the limits; it names those of the last plan
     """
-    from ..explain import refuse_motors, require_hold_at_ends
-
     require_hold_at_ends(search, free)
     plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
     stages = own = adapt_ends(free, search)
@@ -404,8 +407,6 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
     ------
     InfeasibleError  if none is found; it names a shorter period with which one is
     """
-    from ..explain import refuse_motors
-
     scene = search.problem.scene
     controls = 2 if scene.control_hold == "linear" else 1
     held = replace(search, controls=controls)
@@ -582,8 +583,6 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
     """Plan from motions of least violation, or the error that says why there is none."""
-    from ..explain import explain_stages, list_shortfalls, refuse_paths
-
     short, missed = list[list[Stage]](), list[Shortfall]()
     soft = search.soften()
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
