@@ -206,13 +206,11 @@ class TimeSearch:
             solution = self.run(nlp, stages, limits, multipliers, margin)
             if raised or not solution.success:
                 return solution
-            places = [stage.guess.z.reshape(-1, 5) for stage in solution.stages]
-            pairs = zip(solution.stages, places, strict=True)
-            least = [stage.formation.evaluate_limits(z).min(axis=0) for stage, z in pairs]
-            stages = monitor(solution.stages, least, depth)
+            pairs = ((stage.formation, stage.guess.z.reshape(-1, 5)) for stage in solution.stages)
+            least = [formation.evaluate_limits(z).min(axis=0) for formation, z in pairs]
+            stages, nlp = monitor(solution.stages, least, depth), None
             if stages is solution.stages:
                 return solution
-            nlp, multipliers = None, None
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
