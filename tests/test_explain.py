@@ -53,7 +53,7 @@ def why_not(plan: Callable[[], object]) -> str:
 
 
 def search(problem: Problem) -> TimeSearch:
-    return TimeSearch.of(problem, COARSE)
+    return TimeSearch(problem, COARSE)
 
 
 def test_an_object_on_the_palm_alone_stays_at_rest() -> None:
@@ -151,7 +151,7 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    failed = explain_stages(TimeSearch.of(slide, own, slide.phases[:1]), [], None)
+    failed = explain_stages(TimeSearch(slide, own, slide.phases[:1]), [], None)
     assert "leave out --transcription time" in str(failed)
 
 

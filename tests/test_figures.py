@@ -883,7 +883,7 @@ def test_every_solve_is_counted_once(
 
     def count(self: Solver, **arguments: Any) -> Any:
         result = run(self, **arguments)
-        calls.append(self.stats()["iter_count"])
+        calls.append(self.function.stats()["iter_count"])
         return result
 
     monkeypatch.setattr(Solver, "__call__", count)

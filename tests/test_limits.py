@@ -201,7 +201,7 @@ def test_another_limit_is_short_and_gives_way(heptagon: Problem, curves: tuple[C
     # What that motion is short of with the limits as they are: what was added to the torque.
     own = [stage for stage in kept.stages if isinstance(stage, Stage)]
     stages = [replace(stage, formation=phases[0].formation) for stage in own]
-    search = TimeSearch.of(problem, COARSE)
+    search = TimeSearch(problem, COARSE)
     short = {one.limit: one.amount for one in list_shortfalls(search, stages)}
     torque = "torque limit of finger 1 = 0.5 N m"
     assert {torque, "motor curve of finger 1"} <= set(short)

@@ -307,11 +307,8 @@ class Stopped:
     def __init__(self, function: Expression) -> None:
         self.function = function  # has the derivatives
 
-    def __call__(self, x0: Array, **_: Array) -> dict[str, Array]:
-        return {"x": x0}
-
-    def stats(self) -> dict[str, Any]:
-        return {"success": False, "return_status": "Maximum_Iterations_Exceeded"}
+    def __call__(self, x0: Array, **_: Array) -> dict[str, Any]:
+        return {"x": x0, "success": False, "status": "Maximum_Iterations_Exceeded"}
 
 
 def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:

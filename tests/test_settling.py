@@ -494,8 +494,8 @@ def test_a_turn_begins_and_ends_in_other_modes_under_rate_limits() -> None:
     rate, options = 500.0, PlanOptions(accuracy=1e-2, mode_search=False)
     problem, formation, z = turn({"torque_rate_limit": rate})
     planning = Planning(problem, (), options, ())
-    (free,) = plan_free(planning, problem.phases[2:], z, options)
-    ((plan,), _) = plan_block(planning, problem.phases[2:], z, options)
+    (free,) = plan_free(planning, problem.phases[2:], z)
+    ((plan,), _) = plan_block(planning, problem.phases[2:], z)
     assert free.value < plan.value < 1.05 * free.value
     torque, t = plan.torque, np.linspace(0.0, plan.motion.duration, 2001)
     steps = np.abs(np.diff(torque.at(t), axis=0)) / np.diff(t)[:, None]

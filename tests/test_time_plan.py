@@ -45,7 +45,7 @@ from wholearm.planning.time_domain.solution import (
     TimeSolution,
     find_least,
 )
-from wholearm.planning.time_domain.stage import Stage, in_own_units, make_scheme, resample
+from wholearm.planning.time_domain.stage import Stage, in_own_units, resample
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
@@ -169,7 +169,7 @@ def test_modes_without_freedom_are_refused_without_the_solver(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """A single interval with constant torques, at whose end two contacts turn back."""
-    search = replace(TimeSearch.of(landing(), PlanOptions()), scheme=make_scheme("radau", 3, 1))
+    search = TimeSearch(landing(), PlanOptions(), controls=1)
     stage = list_stages(plan_landing())[-1]
     guess = resample(stage.guess, search.scheme, np.array([0.0, 1.0]))
     solution = search.solve([replace(stage, guess=guess, turns=(0, 1))])
@@ -492,7 +492,7 @@ def test_guesses_after_the_homotopy_are_refined_in_turn(monkeypatch: pytest.Monk
     )
     guesses = [Guess(name, [], homotopy=name == "b") for name in "abcd"]
     slide = shipped.problem_of(shipped.BOX)
-    assert time_plan.solve_guesses(TimeSearch.of(slide, PlanOptions()), guesses) is None
+    assert time_plan.solve_guesses(TimeSearch(slide, PlanOptions()), guesses) is None
     assert refined[:2] == ["c", "d"]
 
 
@@ -822,13 +822,13 @@ def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
     least = PlanOptions(objective="effort", time_intervals=8)
     begun = try_phases(problem, problem.phases[4:], start, least, further=True)
     assert begun is not None
-    solution = TimeSearch.of(problem, least).solve(list_stages(begun))
+    solution = TimeSearch(problem, least).solve(list_stages(begun))
     assert solution.success
 
     def value(other: Problem) -> float:
         formations = [phase.formation for phase in in_own_units(other).phases]
         stages = [replace(one, formation=formations[one.phase]) for one in solution.stages]
-        nlp = TimeSearch.of(other, least).build(stages)
+        nlp = TimeSearch(other, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
         g = nlp.solver.function.get_function("nlp_g")(x, [])
         return float(solution.multipliers["lam_g0"] @ g.full()[:, 0])

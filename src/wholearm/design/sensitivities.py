@@ -161,8 +161,8 @@ def _evaluate_path(
         segment = grid.segment[:: path_motion.NODES]
         moved = path_motion.lay_out(edges, segment, (k == 0, k == last), task.is_held)
         parts.append(path_data.prepare(curve, epsilon, moved, phase))
-    data = path_data.join(parts)
-    other = replace(iterate, data=data)
+    other = replace(iterate, parts=parts)
+    data = other.data
     x, p, bounds = iterate.pack(), other.find_parameters(), other.make_bounds()
     f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
     of_x = _charge(iterate.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
@@ -183,10 +183,10 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
     multipliers. SolverError if its NLP has no solution with that price.
     """
     options, scales = planning.options, planning.problem.scene.scales
-    search = solution.TimeSearch.of(planning.problem, options)
+    search = solution.TimeSearch(planning.problem, options)
     if price is not None:
         gradient = price * stage.unit_lengths(scales) / stage.unit_of(options.goal, scales)
-        search.price = solution.Price(gradient, stage.scale_state(block.end, scales))
+        search.price = solution.Price(gradient, block.end / stage.unit_lengths(scales))
     made = search.solve(list_stages(block.plans))
     if not made.success:
         raise SolverError(made.status)
@@ -211,9 +211,9 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
         own, scales = stage.in_own_units(problem), problem.scene.scales
         stages = [_adopt(each, own) for each in made.stages]
         nodes = points[0].nodes.copy()
-        nodes[0, 0] = stage.scale_state(z, scales)
+        nodes[0, 0] = z / stage.unit_lengths(scales)
         stages[0] = replace(stages[0], guess=points[0]._replace(nodes=nodes))
-        other = solution.TimeSearch.of(problem, options)
+        other = solution.TimeSearch(problem, options)
         nlp, raised = other.build(stages), [stage.LimitMisses.none(each) for each in stages]
         bounds, bounds_g = time_nlp.find_bounds(nlp, stages, other.scheme, raised)
         x, written = time_nlp.pack(points, nlp.layouts, 0.0), nlp.assembled[0]

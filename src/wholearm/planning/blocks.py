@@ -35,6 +35,8 @@ from ..results.dwell_record import TorqueChange, change_torques
 from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
+from ..simulation.simulate import simulate
+from .dwell import Junction, add_pause, choose_junction, settle_plans
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
@@ -96,8 +98,6 @@ class Planning:
         """The plans with dwells at their ends, where the problem asks for these."""
         if all(self.problem.settles(phase) == 0 for phase in self.problem.phases):
             return self.plans
-        from .dwell import settle_plans
-
         return settle_plans(self.problem, self.plans)
 
     @cached_property
@@ -110,11 +110,6 @@ class Planning:
     def allow(self, phases: Sequence[Phase]) -> float | None:
         """Longest duration of some phases in all [s], for the objective `margin`."""
         return sum(self.allowed[phase.index] for phase in phases) if self.allowed else None
-
-    def find_before(self, phases: Sequence[Phase]) -> BlockPlan | None:
-        """The planned block that ends where some phases begin."""
-        index = phases[0].index
-        return next((block for block in self.blocks if block.phases[-1].index + 1 == index), None)
 
 
 def plan_blocks(
@@ -185,8 +180,7 @@ def plan_next(
                     replace(planning, problem=pressed),
                     phases,
                     z,
-                    options,
-                    to_go=look_ahead(planning, phases, options) if planning.ahead else None,
+                    to_go=look_ahead(planning, phases) if planning.ahead else None,
                     ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                     fastest=[least[phase.index] for phase in phases if least],
                     begun=known.plans if known and known.coarse else (),
@@ -205,8 +199,6 @@ def _replay(planning: Planning) -> Array:
     Motions with several freedoms are unstable in open loop. Case: query 9 with periods of 2 ms,
     where 2e-6 rad grow 900 times in phase 20.
     """
-    from ..simulation.simulate import simulate
-
     phases = planning.problem.phases[: len(planning.plans)]
     torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
     replay = simulate(replace(planning.problem, phases=phases), torque)
@@ -214,18 +206,18 @@ def _replay(planning: Planning) -> Array:
 
 
 def plan_block(
-    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
+    planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves.
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    problem = planning.problem
+    problem, options = planning.problem, planning.options
     if not runs_along_curves(block, options):
-        return _plan_over_time(planning, block, z, options, over_time), None
+        return _plan_over_time(planning, block, z, over_time), None
     chain = trace_block(planning, block, z)
     if problem.scene.has_slow_motors:
-        return plan_slowly(planning, chain, options), chain
+        return plan_slowly(planning, chain), chain
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
@@ -245,11 +237,7 @@ def trace_block(planning: Planning, block: Sequence[Phase], z: Array) -> ImpactS
 
 
 def _plan_over_time(
-    planning: Planning,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-    over_time: dict[str, Any],
+    planning: Planning, block: Sequence[Phase], z: Array, over_time: dict[str, Any]
 ) -> Plans:
     """Plans of a block in the time domain, from those with free torques if these are limited.
 
@@ -258,14 +246,14 @@ def _plan_over_time(
     """
     from .time_domain.time_plan import plan_with_impacts
 
-    problem, failure = planning.problem, None
+    problem, options, failure = planning.problem, planning.options, None
     slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
     # Coarse plans of the edges of routes are of free torques, others of those of the block.
     coarse, begun = over_time.get("only_begin", False), over_time.pop("begun", ())
     of_free, of_block = (begun, ()) if slow and coarse else ((), begun)
     for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-        free_options = replace(options, mode_search=complete)
-        free = plan_free(planning, block, z, free_options, begun=of_free, **over_time)
+        first = replace(planning, options=replace(options, mode_search=complete))
+        free = plan_free(first, block, z, begun=of_free, **over_time)
         plan: Callable[[float | None], Plans] = partial(
             plan_with_impacts, problem, block, z, options, free=free, begun=of_block, **over_time
         )
@@ -289,15 +277,14 @@ def plan_with_pauses(
     duration: float | None,
 ) -> Plans:
     """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
-    from .dwell import add_pause
-
-    block_before, scene = planning.find_before(block), planning.problem.scene
+    before, scene = planning.plans[-1:], planning.problem.scene
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
         """From the torques before each phase to its first ones."""
-        before = block_before.plans[-1].end_torques[1] if block_before else plans[0].end_torques[0]
-        pairs = zip([before, *(plan.end_torques[1] for plan in plans[:-1])], plans, strict=True)
-        return [change_torques(scene, last, plan.end_torques[0]) for last, plan in pairs]
+        lasts = [plan.end_torques[1] for plan in [*before, *plans[:-1]]]
+        firsts = [plan.end_torques[0] for plan in plans]
+        lasts = lasts if before else [firsts[0], *lasts]
+        return [change_torques(scene, *pair) for pair in zip(lasts, firsts, strict=True)]
 
     plans = plan(duration)
     changes = list_changes(plans)
@@ -311,25 +298,24 @@ def plan_with_pauses(
     ]
 
 
-def plan_free(
-    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
-) -> Plans:
+def plan_free(planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any) -> Plans:
     """Plans of a block over time as it would be planned with free torques, maybe along its curves.
 
     None if it is planned so anyway, or asked for over time without a plan along curves.
     """
-    problem, free_options = free_torques(planning.problem, replace(options, transcription="auto"))
+    problem, options = free_torques(planning.problem, planning.options)
+    options = replace(options, transcription="auto")
     phases = [problem.phases[phase.index] for phase in block]
     freed = problem is not planning.problem
-    if not (freed or runs_along_curves(phases, free_options)):
+    if not (freed or runs_along_curves(phases, options)):
         return []
     over_time |= {"fastest": ()}
     if not planning.problem.scene.control_period:
         # What holding costs is the difference to an accurate plan.
-        over_time["only_begin"], free_options = True, free_options.roughen()
+        over_time["only_begin"], options = True, options.roughen()
     try:
-        free = replace(planning, problem=problem, curves=())
-        return plan_block(free, phases, z, free_options, **over_time)[0]
+        free = replace(planning, problem=problem, options=options, curves=())
+        return plan_block(free, phases, z, **over_time)[0]
     except WholearmError as error:
         if not freed:
             return []
@@ -344,13 +330,14 @@ def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:
     return next((other for other in split_blocks(problem) if other[0].index == index), ())
 
 
-def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
+def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
     """Cost-to-go of a block in the time domain with a free end on a curve.
 
     Without limits of motors: its gradient is nearly the same, and soon known.
     """
-    problem, options = free_torques(planning.problem, options)
-    planning, following = replace(planning, problem=problem), find_following(problem, block)
+    problem, options = free_torques(planning.problem, planning.options)
+    planning = replace(planning, problem=problem, options=options)
+    following = find_following(problem, block)
     if runs_along_curves(block, options) or not following:
         return None
     phase, ending = following[0], block[-1]
@@ -369,7 +356,7 @@ def look_ahead(planning: Planning, block: Sequence[Phase], options: PlanOptions)
         return estimate_time_to_go(phase, problem.epsilon)
 
     def value(z: Array) -> float:
-        return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
+        return sum(plan.value for plan in plan_block(planning, following, z)[0])
 
     return CostToGo(phase, value)
 
@@ -506,22 +493,19 @@ class ImpactSequence:
         return impacts
 
 
-def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptions) -> Plans:
+def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
     """Plan the parts of a block along curves under rate limits, with pauses between them.
 
     Torques change in pauses from those of the block before, and to those of the next one.
     """
-    from .dwell import Junction, add_pause, choose_junction
-
-    epsilon, parts = planning.problem.epsilon, sequence.split()
+    epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
     # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
     more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
     first_epsilon, last_epsilon = (epsilon + max(other - more[1], 0.0) for other in more[::2])
-    block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
-    if block_before is not None:
-        chain, last_plan = block_before.chain, block_before.plans[-1]
-        before = chain.curves[-1] if chain else last_plan.end_torques[1]
+    if planning.blocks:
+        chain, plans_before = planning.blocks[-1].chain, planning.blocks[-1].plans
+        before = chain.curves[-1] if chain else plans_before[-1].end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     beyond: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):

@@ -8,8 +8,8 @@ plan: only what was planned is advised.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -44,8 +44,8 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
-from .nlp import open_ledger
-from .options import Objective, PlanOptions
+from .nlp import open_ledger, setting
+from .options import PlanOptions
 from .path_domain.path_data import fit_torque
 from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
@@ -62,14 +62,9 @@ Replan = Callable[[Parameter, float], object]  # plans with another value of a p
 E = TypeVar("E", InfeasibleError, JammingError)
 
 
-@contextmanager
-def unadvised() -> Iterator[None]:
+def unadvised() -> AbstractContextManager[None]:
     """Have errors say what is missing without looking for changes that would help."""
-    token = _unadvised.set(True)
-    try:
-        yield
-    finally:
-        _unadvised.reset(token)
+    return setting(_unadvised, True)
 
 
 def advise(
@@ -308,7 +303,7 @@ def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
     are tried.
     """
     scene = task.curves[0].formation.scene
-    parts = task.lay_out([np.zeros(0)] * len(task.curves), task.elements)
+    parts = task.lay_out()
 
     def plan(scene: Scene, pins: Pins = (None, None), explained: bool = True) -> Scene:
         curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]
@@ -510,7 +505,7 @@ def explain_stages(
             active = most > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
             return None
-        solution = search.aiming(Objective.RELAX, parameter).solve(nearest)
+        solution = search.soften(parameter).solve(nearest)
         # A limit that may be tighter is not in conflict with the others.
         if not solution.success or solution.cost < 0.0:
             return None

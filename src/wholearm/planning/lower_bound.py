@@ -123,14 +123,18 @@ class LowerBound(NamedTuple):
     error: float  # [s]: that estimate, by quadratures of two orders
 
 
-def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | None:
+def bound_least_time(
+    curves: Sequence[Curve], epsilon: float, intervals: int = GRID_INTERVALS, grids: int = 16
+) -> LowerBound | None:
     """Lower bound of the time along curves; None where no motion is found.
 
-    Curves have speed ratios that make the speed continuous where two of them meet.
+    Curves have speed ratios that make the speed continuous where two of them meet. The first one of
+    the `grids`, at most, has so many `intervals`; losses fall by 64 a grid where speeds are very
+    low.
     """
     path = PathTerms(curves, epsilon)
-    grid, b_guess, bound, tries = path.make_grid(GRID_INTERVALS), None, None, 0
-    for _ in range(16):  # most grids; losses fall by 64 a grid where speeds are very low
+    grid, b_guess, bound, tries = path.make_grid(intervals), None, None, 0
+    for _ in range(grids):
         try:
             bound, losses, motion, time = _bound(path, grid, b_guess)
         except NoMotionError as error:
@@ -156,15 +160,6 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
         b_guess = np.interp(path.place(middles), path.place(grid.angles), motion.b)
         grid = finer
     return bound
-
-
-def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
-    """Lower bound on one coarse grid; see `bound_least_time`. Zero where no motion is found."""
-    path = PathTerms(curves, epsilon)
-    try:
-        return _bound(path, path.make_grid(intervals), None)[0].value
-    except NoMotionError:
-        return 0.0
 
 
 def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:

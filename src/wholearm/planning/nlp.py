@@ -11,13 +11,13 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from operator import add
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -27,6 +27,7 @@ from ..common.sharing import stored
 from ..common.signals import beat, check
 from ..contacts.formation import Formation
 
+_T = TypeVar("_T")
 Indices = Numbers
 Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
 STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
@@ -319,7 +320,7 @@ class Solver:
         self.function = function
 
     def __call__(self, **arguments: Any) -> dict[str, Expression]:
-        """Solve; inputs and outputs are those of a CasADi NLP solver.
+        """Solve; inputs and outputs are those of a CasADi NLP solver, also `success` and `status`.
 
         KeyboardInterrupt if a signal stopped the solver, or the time is over (`OutOfTime`).
         """
@@ -338,7 +339,7 @@ class Solver:
         check()
         if stopped:
             raise KeyboardInterrupt
-        return result
+        return result | {"success": stats["success"], "status": stats["return_status"]}
 
     @cached_property
     def _sizes(self) -> tuple[int, int, int, int]:
@@ -346,11 +347,6 @@ class Solver:
         jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
         sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
         return *sizes, jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
-
-    def stats(self) -> dict[str, Any]:
-        """Statistics of the last call."""
-        statistics: dict[str, Any] = self.function.stats()
-        return statistics
 
 
 @dataclass(frozen=True)
@@ -379,24 +375,26 @@ _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 
 
 @contextmanager
-def open_ledger() -> Iterator[Ledger]:
-    """Collect what solving costs inside the block."""
-    ledger = Ledger()
-    token = _LEDGERS.set((*_LEDGERS.get(), ledger))
-    try:
-        yield ledger
-    finally:
-        _LEDGERS.reset(token)
-
-
-@contextmanager
-def charge(phase: int) -> Iterator[None]:
-    """Book what solving costs inside the block to a phase, by its number."""
-    token = _PHASE.set(phase)
+def setting(variable: ContextVar[_T], value: _T) -> Iterator[None]:
+    """Give a variable another value inside the block."""
+    token = variable.set(value)
     try:
         yield
     finally:
-        _PHASE.reset(token)
+        variable.reset(token)
+
+
+@contextmanager
+def open_ledger() -> Iterator[Ledger]:
+    """Collect what solving costs inside the block."""
+    ledger = Ledger()
+    with setting(_LEDGERS, (*_LEDGERS.get(), ledger)):
+        yield ledger
+
+
+def charge(phase: int) -> AbstractContextManager[None]:
+    """Book what solving costs inside the block to a phase, by its number."""
+    return setting(_PHASE, phase)
 
 
 def book(cost: SolverStatistics, *runs: IpoptRun) -> None:

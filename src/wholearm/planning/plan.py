@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -35,10 +35,9 @@ from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import plan_curves
 from .phase_plan import PlanPart, Plans, combine, plan_stops
+from .replay_check import replay_plan
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
-
-if TYPE_CHECKING:
-    from .robust.robust_rows import Guide
+from .robust.robust_rows import Guide, list_holds, measure_holds
 
 
 def solve(
@@ -127,8 +126,6 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         unique = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
         planned, figures = time.perf_counter(), None
         if options.replay:
-            from .replay_check import replay_plan
-
             first = planning
             planning, figures = replay_plan(planning, report)
             if planning is not first:
@@ -284,8 +281,6 @@ def certify(planning: Planning) -> Certificate:
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
     """Plan without ranges, and if asked for find the widest ranges along curves."""
-    from .robust.robust_rows import Guide, list_holds, measure_holds
-
     options, problem = planning.options, planning.problem
     scales = problem.scene.scales
     report("planning without ranges")
@@ -325,8 +320,6 @@ def _find_widest(
     The minimum-time sweep decides each step of a bisection; then plans are tried with ever smaller
     factors. `guides` are a motion along each curve.
     """
-    from .robust.robust_rows import Guide
-
     first = part.make_task(planning.problem.epsilon, planning.options)
 
     def scale(factor: float) -> PlanOptions:

@@ -14,10 +14,6 @@ from ..common.errors import SolverError
 SOLVES = 40  # most of one refinement
 
 
-class CostlyError(SolverError):
-    """A solution costs so much more than the first one that further ones are of no use."""
-
-
 class Iterate(Protocol):
     """A mesh of a transcription, with the solution on it or the point to start from."""
 
@@ -45,7 +41,7 @@ I = TypeVar("I", bound=Iterate)  # noqa: E741
 def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
     """The solution without violations whose estimated error is below the accuracy, or least.
 
-    The SolverError if none keeps the limits between nodes is that of the first mesh, or costly.
+    The SolverError if none keeps the limits between nodes is that of the first mesh.
     """
     iterate: I | None = first
     best: I | None = None
@@ -56,8 +52,6 @@ def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
             break
         try:
             iterate = iterate.solve()
-        except CostlyError:
-            raise
         except SolverError as error:
             failure = failure or error
             if best is not None:

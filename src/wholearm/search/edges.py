@@ -19,7 +19,7 @@ from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import NoMotionError, find_duration, make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import find_minors
 from ..planning.blocks import BEND, compute_curve_impact
-from ..planning.lower_bound import PathTerms, bound_least_time, bound_roughly, find_limits
+from ..planning.lower_bound import PathTerms, bound_least_time, find_limits
 from ..problem.definition import End, Goal, Phase, Until
 from .places import RoadmapPlace, make_place, measure_along
 
@@ -135,7 +135,8 @@ class Edge:
     @cached_property
     def bound(self) -> float:
         """Lower bound of the duration on a coarse grid [s]."""
-        return max(0.0, bound_roughly(*self._path, INTERVALS))
+        bound = bound_least_time(*self._path, INTERVALS, grids=1)
+        return bound.value if bound else 0.0
 
     @cached_property
     def fine_bound(self) -> float:

@@ -6,8 +6,8 @@ through the knots give them where limits are checked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,8 @@ from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
+from ..robust.robust_rows import RobustLimits, spread_limits
 from .path_motion import Elements, Grid, PathMotion, Profile
-
-if TYPE_CHECKING:
-    from ..robust.robust_rows import RobustLimits
 
 PLACES = 13  # interpolation points where torques of a motion are not those through the knots
 LOOKS = 21  # samples of torque rates in each interval
@@ -38,18 +36,19 @@ class Sampling(NamedTuple):
 class Places(NamedTuple):
     """Inverse dynamics at n places of a curve."""
 
-    forces: PathForces
+    of_c: Array  # of_c, of_tau: coefficients of forces, as in `PathForces`
+    of_tau: Array
     rates: Array  # (n, 2): d theta / ds
     variations: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
 
+    @property
+    def forces(self) -> PathForces:
+        """Contact forces and torques."""
+        return PathForces(self.of_c, self.of_tau)
+
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
-        return self.map(lambda table: table[rows])
-
-    def map(self, change: Callable[[Array], Array]) -> Places:
-        """The same with every table changed."""
-        forces = PathForces(*map(change, self.forces))
-        return Places(forces, change(self.rates), change(self.variations))
+        return Places(*(table[rows] for table in self))
 
 
 class PhaseData(NamedTuple):
@@ -64,7 +63,6 @@ class PhaseData(NamedTuple):
     sampling: Sampling
     knots: Places  # at the knots of every solid interval, interval by interval
     checks: Places  # at the checks of every solid interval, interval by interval
-    rate_limit: Array  # (2,) [N m/s]: of torques, infinite where they may step
     spread: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
@@ -161,7 +159,7 @@ def prepare(
     variations = np.zeros((len(s), 0))
     if spread is not None:
         variations = spread.find_variations(formation, point, directions, forces, epsilon)
-    every = Places(forces, point.z_s[:, 3:], variations)
+    every = Places(*forces, point.z_s[:, 3:], variations)
     added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
     knots = every.pick(np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel())
 
@@ -176,22 +174,18 @@ def prepare(
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
         return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
-    nodes, checks = every.pick(slice(None, len(grid.s))), knots.map(interpolate)
+    nodes, checks = every.pick(slice(None, len(grid.s))), Places(*map(interpolate, knots))
     limits = make_limits(formation, epsilon)
     if spread is not None:
-        from ..robust.robust_rows import spread_limits
-
         limits = spread_limits(limits)
         inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
         nodes, checks = (
-            each._replace(
-                forces=spread.extend(each.forces, each.variations, spread.pick_signs(*at))
-            )
+            each._replace(of_c=spread.extend(each.of_c, each.variations, spread.pick_signs(*at)))
             for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
         )
-    kept, rates = limits.split(2), formation.scene.torque_rate_limit
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
+    kept = limits.split(2)
+    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, spread)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -203,27 +197,19 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         return parts[0]
     if any(not np.array_equal(part.limits.rows, parts[0].limits.rows) for part in parts):
         raise ValueError("phases with different rows of limits cannot be joined")
-    starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
-    segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
+    grids, start, segment = list[Grid](), 0.0, 0
+    for grid in (part.grid for part in parts):
+        grids.append(Grid(start + grid.s, segment + grid.segment, grid.maps))
+        start, segment = grids[-1].s[-1], grids[-1].segment[-1] + 1
 
-    def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
-        pairs = zip(arrays, firsts[:-1], strict=True)
-        return np.concatenate([array + first for array, first in pairs])
-
-    def stack(places: Sequence[Places]) -> Places:
-        forces, *tables = zip(*places, strict=True)
-        columns = zip(*forces, strict=True)
-        return Places(PathForces(*map(np.concatenate, columns)), *map(np.concatenate, tables))
+    def stack(tables: Iterable[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+        return [*map(np.concatenate, zip(*tables, strict=True))]
 
     return parts[0]._replace(
-        grid=Grid(
-            chain((part.grid.s for part in parts), starts),
-            chain((part.grid.segment for part in parts), segments),
-            np.concatenate([part.grid.maps for part in parts]),
-        ),
-        nodes=stack([part.nodes for part in parts]),
-        knots=stack([part.knots for part in parts]),
-        checks=stack([part.checks for part in parts]),
+        grid=Grid(*stack(grids)),
+        nodes=Places(*stack(part.nodes for part in parts)),
+        knots=Places(*stack(part.knots for part in parts)),
+        checks=Places(*stack(part.checks for part in parts)),
     )
 
 

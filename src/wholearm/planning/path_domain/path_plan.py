@@ -33,7 +33,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -49,6 +49,7 @@ from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration
 from ..refinement import SOLVES, refine
+from ..robust.robust_rows import Guide, RobustLimits, list_holds, measure_holds, spread
 from .path_data import PhaseData, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
@@ -60,9 +61,6 @@ from .path_mesh import (
     make_grid,
 )
 from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basis, follow, list_maps
-
-if TYPE_CHECKING:
-    from ..robust.robust_rows import Guide, RobustLimits
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
@@ -187,8 +185,6 @@ def find_sure_start(
     margin : [N]  of normal forces over epsilon
     ranges        of parameters, within all of which it has to leave rest
     """
-    from ..robust.robust_rows import list_holds, measure_holds
-
     formation, forces = data.curve.formation, data.nodes.forces
     holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.lam[0]])
@@ -250,8 +246,6 @@ class Task:
         """Robust force limits of each curve, None without ranges."""
         if not self.guides:
             return [None] * len(self.curves)
-        from ..robust.robust_rows import spread
-
         args = self.epsilon, self.options.ranges
         return [spread(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
 
@@ -268,10 +262,11 @@ class Task:
             return _RATE if self.is_held else few
         return max(-(-self.options.intervals // DEGREE), 3)
 
-    def lay_out(self, breaks: Sequence[Array], elements: int) -> list[PhaseData]:
+    def lay_out(self, elements: int = 0, breaks: Sequence[Array] = ()) -> list[PhaseData]:
         """Each phase on elements with breaks: as many as wanted, if that is enough for these."""
-        pairs, last = list(zip(self.curves, breaks, strict=True)), len(breaks) - 1
-        elements = max(elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
+        breaks, last = breaks or [np.zeros(0)] * len(self.curves), len(self.curves) - 1
+        pairs = list(zip(self.curves, breaks, strict=True))
+        elements = max(elements or self.elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
         grids = [
             make_grid(*pair, elements, (k == 0, k == last), self.is_held)
             for k, pair in enumerate(pairs)
@@ -284,7 +279,7 @@ class Task:
 
     def find_fastest(self) -> Fastest | None:
         """The minimum-time speed profile of a sweep; None without one."""
-        return find_fastest(join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements)))
+        return find_fastest(join(self.lay_out()))
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
@@ -309,18 +304,28 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
         raise AmbiguityError(f"phase {phase}: {text}")
 
 
+class Tightening(NamedTuple):
+    """Tightening of limits at the nodes so that they hold between nodes too."""
+
+    limits: Array | float = 0.0  # (N + 1, n_sides) [N, N m]: of each side of the limits
+    # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
+    missed: Array | float = 0.0
+    # (N + 1, 5): factors on the largest b, both torque rate limits and both largest commands
+    shares: Array | float = 1.0
+    late: float = 1.0  # factor on the longest duration, if there is one
+
+
 @dataclass(frozen=True)
 class PathIterate:
     """A mesh with its NLP, and the solution on it or the point to start from."""
 
     task: Task
     parts: list[PhaseData]  # each phase on its grid
-    data: PhaseData  # all phases as one
-    nlp: PathNLP
     units: Units
     profile: Profile
-    margin: float  # [N]: over epsilon
-    tightening: Tightening  # of the limits for that
+    goal: Objective
+    margin: float = 0.0  # [N]: over epsilon
+    tightening: Tightening = field(default_factory=Tightening)  # of the limits for that
     multipliers: dict[str, Array] = field(default_factory=dict)  # empty at a point to start from
     cost: float = np.inf  # in the units of the NLP
     duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
@@ -330,9 +335,7 @@ class PathIterate:
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
         """Start from the minimum-time speed profile, or a parabola of the squared speed."""
-        breaks = [np.zeros(0)] * len(task.curves)
-        parts = task.lay_out(breaks, elements)
-        data = join(parts)
+        data, breaks = join(parts := task.lay_out(elements)), [np.zeros(0)] * len(task.curves)
         profile, units = guess(data, task.options.time_weight)
         swept = task.options.goal is Objective.TIME and not task.is_held
         if swept and (fastest := find_fastest(data)):
@@ -343,38 +346,30 @@ class PathIterate:
                 on_curve = keep_apart(curve, fastest.switches[owner == k] - starts[k])
                 if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
                     breaks[k] = on_curve
-            parts = task.lay_out(breaks, elements)
+            parts = task.lay_out(elements, breaks)
             profile = guess_below(join(parts), fastest)
-        return PathIterate.on(task, parts, units, profile, 0.0)
-
-    @staticmethod
-    def on(
-        task: Task,
-        parts: list[PhaseData],
-        units: Units,
-        profile: Profile,
-        margin: float,
-        goal: Objective | None = None,
-    ) -> PathIterate:
-        """The NLP on the elements of phases, near a motion and its margin [N].
-
-        Its objective is that of the task if left out.
-        """
-        data = join(parts)
-        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal or task.options.goal)
-        none = np.zeros((len(data.grid.s), len(data.spans)))
-        tightening = Tightening(none, none, np.ones((len(none), 5)), task.duration)
-        return PathIterate(task, parts, data, nlp, units, profile, margin, tightening)
+        return PathIterate(task, parts, units, profile, task.options.goal)
 
     @staticmethod
     def elastic(task: Task) -> PathIterate:
         """The problem with soft limits, from a slow motion whatever they are."""
-        data = join(parts := task.lay_out([np.zeros(0)] * len(task.curves), task.elements))
+        data = join(parts := task.lay_out())
         profile, units = _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
         # A shortfall of torque is as bad as one of force.
         torque = np.full(2, 15.0 * data.curve.formation.scene.scales.torque)
         units = units._replace(torque=torque)
-        return PathIterate.on(task, parts, units, profile, 0.0, Objective.ELASTIC)
+        return PathIterate(task, parts, units, profile, Objective.ELASTIC)
+
+    @cached_property
+    def data(self) -> PhaseData:
+        """All phases as one."""
+        return join(self.parts)
+
+    @cached_property
+    def nlp(self) -> PathNLP:
+        """The NLP on their elements."""
+        steps = len(self.data.grid.steps)
+        return build_path_nlp(LimitShape.of(self.data), steps, self.goal)
 
     def restart(self) -> PathIterate | None:
         """The solution on the mesh before with tightened limits, or more elements, once."""
@@ -393,21 +388,20 @@ class PathIterate:
         solver = nlp.solver if self.multipliers else nlp.starter
         bounds |= self.multipliers or self._center()
         result = solver(x0=self.pack(), p=self.find_parameters(), **bounds)
-        stats = solver.stats()
-        if not stats["success"]:
-            raise SolverError(f"Ipopt stopped with {stats['return_status']}")
+        if not result["success"]:
+            raise SolverError(f"Ipopt stopped with {result['status']}")
         # b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
         x, table = result["x"].full()[:, 0], np.zeros(nlp.free.shape)
         table[nlp.free] = x
         profile = follow(self.data.grid, *(table[:, [1, 2]] * units.profile[1:]).T)
-        margin = float(x[-1]) * units.force if nlp.objective is Objective.MARGIN else 0.0
+        margin = float(x[-1]) * units.force if self.goal is Objective.MARGIN else 0.0
         return replace(
             self,
             profile=profile,
             margin=margin,
             multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
             cost=float(result["f"]),
-            duration=float(result["g"][-1]) * units.time if self.tightening.duration else 0.0,
+            duration=float(result["g"][-1]) * units.time if self.task.duration else 0.0,
         )
 
     def pack(self) -> Array:
@@ -418,7 +412,7 @@ class PathIterate:
         nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
         table = np.empty(nlp.free.shape)
         table[:, nlp.node["extra"]] = self.margin / units.force
-        if nlp.objective is Objective.ELASTIC:
+        if self.goal is Objective.ELASTIC:
             short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
             short += 0.05 * data.limits.scales
             table[:, nlp.node["extra"]] = short / units.of(data.limits)
@@ -442,7 +436,7 @@ class PathIterate:
             "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
             "torque": data.nodes.forces.of_tau[..., ONE] / torque,
             "joints": torque**2 / units.power,
-            "quick": (torque / units.time / data.rate_limit)[list(shape.rates)],
+            "quick": (torque / units.time / scene.torque_rate_limit)[list(shape.rates)],
             "lags": scene.actuator_lag[list(shape.commands)] / units.time,
             "maps": data.grid.maps,
             "sizes": data.grid.sizes,
@@ -453,8 +447,9 @@ class PathIterate:
         """Bounds of the NLP, with every limit tightened."""
         nlp, data, units, tightening = self.nlp, self.data, self.units, self.tightening
         start, pins = self.task.start, self.task.pins
-        share, quickest, most = np.split(tightening.shares, [1, 3], axis=1)
         n, node = len(data.grid.s), nlp.node
+        shares = np.broadcast_to(tightening.shares, (n, 5))
+        share, quickest, most = np.split(shares, [1, 3], axis=1)
         low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
         b_max = data.largest_b(data.nodes)
         # Next to rest b is 2 s times the least s''.
@@ -475,18 +470,18 @@ class PathIterate:
         for place, pin in zip((0, -1), pins, strict=True):
             if pin is not None:
                 low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
-        low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+        low[:, node["extra"]] = -np.inf if self.goal is Objective.MARGIN else 0.0
         rows, signs, bounds = data.limits.sides
         sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
         sides /= units.of(data.limits)[rows]
-        side = np.arange(len(rows)) if nlp.objective is Objective.ELASTIC else rows
+        side = np.arange(len(rows)) if self.goal is Objective.ELASTIC else rows
         width = nlp.g.sizes["limits"] // n
         rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
         rows_low[:, side[signs > 0]] = sides[:, signs > 0]
         rows_high[:, side[signs < 0]] = sides[:, signs < 0]
         late = nlp.g.sizes["duration"]
         equal = np.zeros(nlp.g["limits"].start)
-        longest = np.full(late, (tightening.duration or np.inf) / units.time)
+        longest = np.full(late, (self.task.duration or np.inf) * tightening.late / units.time)
         rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
         torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
         most = most * data.torque_limit / torque
@@ -506,7 +501,7 @@ class PathIterate:
         Empty where limits are soft.
         """
         nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
-        if nlp.objective is Objective.ELASTIC:
+        if self.goal is Objective.ELASTIC:
             return {}
         (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
         slack = data.slack(data.nodes, profile, self.margin) / units.of(data.limits)[rows]
@@ -554,23 +549,24 @@ class PathIterate:
         """Start on at least so many other elements, with these breaks, from this motion."""
         every, held = zip(self.task.curves, breaks, strict=True), self.task.is_held
         ends = [keep_apart(curve, places, held) for curve, places in every]
-        parts = self.task.lay_out(ends, elements)
+        parts = self.task.lay_out(elements, ends)
         grid = join(parts).grid
         profile = Elements(self.data.grid, self.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.on(self.task, parts, self.units, profile, self.margin)
-        return replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
+        fresh: dict[str, Any] = {"tightening": Tightening(), "multipliers": {}}
+        fresh |= {"meshes": self.meshes + 1, "before": replace(self, before=None)}
+        return replace(self, parts=parts, profile=profile, **fresh)
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
         data, tight = self.data, self.tightening
         short, over, _ = self.misses
-        duration = self.task.duration
-        if duration is not None:
+        late = 1.0
+        if self.task.duration is not None:
             # The quadrature of the NLP is not that of the motion.
             off = self.duration / sum(motion.duration for motion in self.motions)
-            duration *= float(np.clip(off, 0.8, 1.2))
+            late = float(np.clip(off, 0.8, 1.2))
         # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
         # Case: the largest margin of phase 3 of the heptagon on four contacts.
         slack, k = data.slack(data.nodes, self.profile, self.margin), data.grid.nonempty
@@ -578,7 +574,7 @@ class PathIterate:
         reach = np.where(short > 0, least, 0.0)
         added, less = (1.05 * data.spread_to_nodes(violation) for violation in (short, over))
         limits = np.maximum(tight.limits, data.spread_to_nodes(reach)) + added
-        tighter = Tightening(limits, tight.missed + added, tight.shares * (1 - less), duration)
+        tighter = Tightening(limits, tight.missed + added, tight.shares * (1 - less), late)
         return replace(self, tightening=tighter)
 
     @cached_property
@@ -592,8 +588,6 @@ class PathIterate:
     @property
     def guides(self) -> tuple[Guide, ...]:
         """The motion along each curve as a reference."""
-        from ..robust.robust_rows import Guide
-
         return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property
@@ -607,8 +601,8 @@ class PathIterate:
         short, over[:, 0] = data.misses(profile, self.margin)
         if data.grid.held:
             torques, rates = find_torques(data, profile, self.motions)
-            rate = np.abs(rates).max(axis=2) / data.rate_limit
-            lags = data.curve.formation.scene.actuator_lag
+            scene = data.curve.formation.scene
+            rate, lags = np.abs(rates).max(axis=2) / scene.torque_rate_limit, scene.actuator_lag
             command = np.abs(torques + lags[:, None] * rates).max(axis=2) / data.torque_limit
             over[:, 1:] = np.maximum(np.hstack([rate, command * (lags > 0)]) - 1, 0.0)
         return short, over, late
@@ -636,7 +630,7 @@ class PathIterate:
         """Relative cost at each node of the tightening so far."""
         return self._price(self.tightening.missed, 1 - self.tightening.shares)
 
-    def _price(self, limits: Array, shares: Array) -> Array:
+    def _price(self, limits: Array | float, shares: Array | float) -> Array:
         """First-order relative cost of tightening at each node, shape (n,).
 
         The sum of multipliers times the tightening of limits, (n, n_sides), and what is taken from
@@ -788,16 +782,6 @@ class SureStart(NamedTuple):
     high: float
 
 
-class Tightening(NamedTuple):
-    """Tightening of limits at the nodes so that they hold between nodes too."""
-
-    limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
-    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
-    # (N + 1, 5): factors on the largest b, both torque rate limits and both largest commands
-    shares: Array
-    duration: float | None  # [s]: longest duration, if there is one
-
-
 @dataclass(frozen=True, eq=False)
 class PathNLP:
     """A built NLP."""
@@ -807,7 +791,6 @@ class PathNLP:
     starter: Expression  # for points that are no solution, with slacks near the central path
     shape: LimitShape
     intervals: int
-    objective: Objective
     # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
     # shortfalls for `elastic`, or the least margin
     node: Columns
@@ -928,7 +911,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         same = {key: solver.function.get_function(name) for key, name in derived.items()}
         starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
     node = Columns(b=1, a=1, lam=1, extra=extra.shape[1])
-    return PathNLP(solver, starter, shape, intervals, objective, node, p, g)
+    return PathNLP(solver, starter, shape, intervals, node, p, g)
 
 
 # Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one

@@ -65,15 +65,9 @@ class RobustLimits(NamedTuple):
         epsilon: float,
     ) -> Array:
         """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
-        state = Sensitivity.of_curve(formation, point, directions, forces)
-        slopes = state.find_slopes(self.names)
-        variations = np.einsum("mi,nipq->nmpq", self.rows, slopes)
-        for k, name in enumerate(self.names):
-            edges = find_edges(formation, self.rows, name)
-            if edges is not None:
-                variations[:, :, k] += edges @ forces.of_c
-                variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
-        return np.asarray(variations * self.radii[:, None])
+        slopes = Sensitivity.of_curve(formation, point, directions, forces).find_slopes(self.names)
+        given = formation, self.rows, self.names, slopes, forces.of_c, epsilon
+        return find_variations(*given) * self.radii[:, None]
 
     def pick_signs(self, s: Array, segment: Numbers) -> NDArray[np.int8]:
         """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
@@ -84,12 +78,11 @@ class RobustLimits(NamedTuple):
             rows[here] = table[np.searchsorted((places[1:] + places[:-1]) / 2, s[here])]
         return self.signs[rows]
 
-    def extend(self, forces: PathForces, variations: Array, signs: NDArray[np.int8]) -> PathForces:
-        """Forces with the robust value of each copy of each limit as further columns."""
+    def extend(self, of_c: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
+        """Contact forces with the robust value of each copy of each limit as further columns."""
         spread = np.einsum("nmkp,nmpq->nmkq", signs, variations)
-        nominal = np.repeat(self.rows @ forces.of_c, spread.shape[2], axis=1)
-        wider = np.concatenate([forces.of_c, nominal - spread.reshape(nominal.shape)], axis=1)
-        return forces._replace(of_c=wider)
+        nominal = np.repeat(self.rows @ of_c, spread.shape[2], axis=1)
+        return np.concatenate([of_c, nominal - spread.reshape(nominal.shape)], axis=1)
 
     def evaluate(
         self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
@@ -99,19 +92,30 @@ class RobustLimits(NamedTuple):
         return np.asarray(nominal - np.abs(measure(variations, motion)).sum(axis=2))
 
 
-def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
-    """The part of force limits, rows of shape (m, n_c + R), proportional to a friction, if any.
+def find_variations(
+    formation: Formation,
+    rows: Array,
+    names: Sequence[str],
+    slopes: Array,
+    of_c: Array,
+    epsilon: float,
+) -> Array:
+    """Derivatives of force limits by p parameters, shape (n, m, p, k) [N per unit].
 
-    A cone's edge is mu (c_n - epsilon); c_n >= epsilon is free of friction.
+    From rows h, (m, n_c + R), and k coefficients, the first of 1, of the slopes (n, n_c + R, p, k)
+    of forces and of these, (n, n_c + R, k). A cone's edge, mu (c_n - epsilon), is proportional to
+    its friction; c_n >= epsilon is free of that.
     """
-    if not name.startswith("friction") or not formation.rolling:
-        return None
-    part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
-    count = formation.n_contacts
-    edges = np.where((rows[:, count:] != 0).any(axis=1)[:, None], rows, 0.0)
-    edges[:, count:] = 0.0
-    edges[:, :count] *= [contact.finger == part for contact in formation.contacts]
-    return edges
+    variations, count = np.einsum("mi,nipq->nmpq", rows, slopes), formation.n_contacts
+    cones = (rows[:, count:] != 0).any(axis=1)[:, None]
+    for k, name in enumerate(names):
+        if name.startswith("friction"):
+            part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
+            mine = [contact.finger == part for contact in formation.contacts]
+            edges = cones * rows[:, :count] * mine
+            variations[:, :, k] += edges @ of_c[:, :count]
+            variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
+    return np.asarray(variations)
 
 
 def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
@@ -173,7 +177,7 @@ def _find_signs(
     signs[:, :, 4] = np.sign(measure(variations, motion))
     forced = limits.only(PRESS, CONE)
     for turn in range(8):  # cutting planes
-        extended = bare.extend(forces, variations, signs)
+        extended = forces._replace(of_c=bare.extend(forces.of_c, variations, signs))
         sides = PathLimits.of(wider, extended, rates)
         rows = sides.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))

@@ -52,7 +52,7 @@ from .mode_search import (
     release_earlier,
 )
 from .solution import TimeSearch, TimeSolution
-from .stage import Scheme, Stage, StagePoints, scale_state, unit_points
+from .stage import Scheme, Stage, StagePoints, unit_lengths, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
 GIVEN = "the contact modes that the problem gives"
@@ -142,7 +142,7 @@ class Guesses:
                     raise InputError("", f"phases[{phase.number}].guess", text)
                 t.append(start + mode.t)
                 z.append(closed)
-        own_t, own_z = np.array(t) / scales.time, scale_state(np.array(z), scales)
+        own_t, own_z = np.array(t) / scales.time, np.array(z) / unit_lengths(scales)
         path = CubicSpline(own_t, own_z, bc_type="clamped")
         # Phase 19 of query 62 has no solution in given modes on the usual intervals.
         finer = (1,) if self.search.options.time_intervals else (1, 2)
@@ -599,7 +599,7 @@ def guess_stages(
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
         z, scaled = outlines[-1].z[-1], search.problem.phases[phase.index]
         for piece in outlines:
-            own_z = scale_state(piece.z, scene.scales)
+            own_z = piece.z / unit_lengths(scene.scales)
             parts.append((scaled, replace(piece, formation=scaled.formation, z=own_z)))
     lengths = np.array([outline.length for _, outline in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()

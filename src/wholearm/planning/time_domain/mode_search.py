@@ -443,7 +443,8 @@ def _find_held(stage: Stage, scheme: Scheme, slow: bool) -> list[ModeRun]:
     near = (senses < least + 1e-2 * fast).reshape(shape).all(axis=1)
     held = np.repeat(near & (count > 0) if slow else count > 1, scheme.degree, axis=0)
     held[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = False
-    return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
+    columns = enumerate(held.T)
+    return [run for row, flags in columns for run in _find_run(flags, stage, scheme, row)]
 
 
 def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) -> list[ModeRun]:
@@ -459,23 +460,20 @@ def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) 
         rounding = 1e-4 * mu * c_n
         near = mu * (c_n - epsilon) - np.abs(c_t) < rounding  # about to slide
         for sign in (1.0, -1.0):
-            leaning = np.zeros((len(c_n), n_c + 2), dtype=bool)
             # Friction pushes against sliding. At c_n = epsilon its sign is that of rounding: both
             # directions count (goal 45).
-            leaning[:, row] = near & (sign * c_t < rounding)
-            runs += _find_runs(leaning, stage, scheme, np.full(n_c + 2, sign))
+            runs += _find_run(near & (sign * c_t < rounding), stage, scheme, row, sign)
     return runs
 
 
-def _find_runs(flags: Flags, stage: Stage, scheme: Scheme, signs: Array) -> list[ModeRun]:
-    """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
-    longest, breaks = [], stage.guess.breaks
-    for row, column in enumerate(flags.T):
-        runs = find_runs(column, scheme.degree)
-        if not runs:
-            continue
-        run = max(runs, key=lambda run: run.stop - run.start)
-        begin, stop = run.start // scheme.degree, -(-run.stop // scheme.degree)
-        share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
-        longest.append(ModeRun(row, begin, stop, float(signs[row]), share))
-    return longest
+def _find_run(
+    flags: Flags, stage: Stage, scheme: Scheme, row: int, sign: float = 0.0
+) -> list[ModeRun]:
+    """The longest run of True at the points, (K d,), of a row, if it is an interval long."""
+    runs, breaks = find_runs(flags, scheme.degree), stage.guess.breaks
+    if not runs:
+        return []
+    run = max(runs, key=lambda run: run.stop - run.start)
+    begin, stop = run.start // scheme.degree, -(-run.stop // scheme.degree)
+    share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
+    return [ModeRun(row, begin, stop, sign, share)]

@@ -29,8 +29,8 @@ from ...mechanics.sensitivity import find_slopes_at
 from ...problem.definition import PARAMETERS, Phase, Problem
 from ...results.trajectory import Samples
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
-from ..refinement import CostlyError, refine
-from ..robust.robust_rows import find_edges
+from ..refinement import refine
+from ..robust.robust_rows import find_variations
 from .stage import (
     LimitMisses,
     Scheme,
@@ -111,34 +111,37 @@ class TimeSearch:
     """Data common to all solves for a plan, and their statistics."""
 
     source: Problem
-    phases: Sequence[Phase]  # those of the NLP
-    problem: Problem  # in the scene's own units
     options: PlanOptions
-    scheme: Scheme
-    duration: float | None  # [s]: longest duration, for the objective `margin`
-    goal: Objective
+    phases: Sequence[Phase] = ()  # those of the NLP; all of the problem if left out
+    duration: float | None = None  # [s]: longest duration, for the objective `margin`
     to_go: CostToGo | None = None
     ample: float = math.inf  # [N]: normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
+    controls: int = 0  # control points of torques in an interval; 0: as many as points
+    soft: Objective | None = None  # `elastic` or `relax`, in place of the options' objective
     relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
     price: Price | None = None  # in the scene's own units
     searched: bool = False  # whether the modes of the first guess are those of a mode search
     tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
-    @staticmethod
-    def of(
-        problem: Problem,
-        options: PlanOptions,
-        phases: Sequence[Phase] = (),
-        duration: float | None = None,
-        to_go: CostToGo | None = None,
-        ample: float = math.inf,
-        only_begins: bool = False,
-    ) -> TimeSearch:
-        """A search with the arguments of `plan_phases`."""
-        scheme = make_scheme(options.scheme, options.degree, options.degree)
-        given = phases or problem.phases, in_own_units(problem), options, scheme, duration
-        return TimeSearch(problem, *given, options.goal, to_go, ample, only_begins)
+    def __post_init__(self) -> None:
+        self.phases = self.phases or self.source.phases
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The problem in its scene's own units."""
+        return in_own_units(self.source)
+
+    @property
+    def goal(self) -> Objective:
+        """The objective."""
+        return self.soft or self.options.goal
+
+    @property
+    def scheme(self) -> Scheme:
+        """The collocation scheme."""
+        degree = self.options.degree
+        return make_scheme(self.options.scheme, degree, self.controls or degree)
 
     @property
     def numbers(self) -> list[int]:
@@ -153,16 +156,14 @@ class TimeSearch:
         value, gradient = self.to_go.expand(z * lengths)
         return value / unit, Price(gradient * lengths / unit, z)
 
-    def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> TimeSearch:
-        """The same search with another objective.
+    def soften(self, relaxation: Parameter | None = None) -> TimeSearch:
+        """The same search with soft limits, or one that is relaxed, for the least of that.
 
-        Soft limits go with linear torques: others might keep them at the points alone.
+        These go with linear torques: others might keep them at the points alone.
         """
-        name, degree = self.scheme.name, self.scheme.degree
-        linear = goal in (Objective.ELASTIC, Objective.RELAX)
-        scheme = make_scheme(name, degree, 2 if linear else degree)
-        other = replace(self, duration=None, to_go=None, price=None)
-        return replace(other, goal=goal, relaxation=relaxation, scheme=scheme)
+        soft = Objective.RELAX if relaxation else Objective.ELASTIC
+        other = replace(self, soft=soft, relaxation=relaxation, controls=2)
+        return replace(other, duration=None, to_go=None, price=None)
 
     def has_ample(self, solution: TimeSolution) -> bool:
         """Whether the objective `margin` is saturated."""
@@ -205,13 +206,11 @@ class TimeSearch:
             solution = self.run(nlp, stages, limits, multipliers, margin)
             if raised or not solution.success:
                 return solution
-            places = [stage.guess.z.reshape(-1, 5) for stage in solution.stages]
-            pairs = zip(solution.stages, places, strict=True)
-            least = [stage.formation.evaluate_limits(z).min(axis=0) for stage, z in pairs]
-            stages = monitor(solution.stages, least, depth)
+            pairs = ((stage.formation, stage.guess.z.reshape(-1, 5)) for stage in solution.stages)
+            least = [formation.evaluate_limits(z).min(axis=0) for formation, z in pairs]
+            stages, nlp = monitor(solution.stages, least, depth), None
             if stages is solution.stages:
                 return solution
-            nlp, multipliers = None, None
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
@@ -252,18 +251,17 @@ class TimeSearch:
         x0 = pack([stage.guess for stage in stages], nlp.layouts, margin)
         bounds = {"lbx": low, "ubx": high, "lbg": low_g, "ubg": high_g}
         result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
-        if near and not solver.stats()["success"]:
+        if near and not result["success"]:
             solver = nlp.make_solver(1e-2, **MONOTONE)
             result = solver(x0=x0, p=price.gradient, **bounds, **multipliers)
-        stats = solver.stats()
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(price.gradient @ price.origin)
         pairs = zip(stages, unpack(x, nlp.layouts), strict=True)
         solved = [replace(stage, guess=part) for stage, part in pairs]
         multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        status = f"Ipopt stopped with {stats['return_status']}"
+        status = f"Ipopt stopped with {result['status']}"
         margin = -cost if self.goal is Objective.MARGIN else 0.0
-        return TimeSolution(solved, cost, margin, status, stats["success"], nlp, multipliers)
+        return TimeSolution(solved, cost, margin, status, result["success"], nlp, multipliers)
 
 
 @dataclass(frozen=True)
@@ -321,21 +319,20 @@ class TimeIterate:
     stages: list[Stage]
     raised: list[LimitMisses]  # limits of the stages, by these amounts
     highest: float  # cost above which refinement ends
-    is_solved: bool = True
     change: float = 0.01  # of the cost by the last finer intervals, relative; at first a guess
     least: float = math.nan  # cost of the first solution on these intervals
     refined: int = 0  # iterates with finer intervals so far
 
     def solve(self) -> TimeIterate:
         """The solution on these stages."""
-        if self.is_solved:
+        if self.stages is self.solution.stages:
             return self
         most = SETTINGS.patience * (2 if self.search.problem.scene.has_slow_motors else 1)
         solution = self.search.solve(self.stages, self.solution, most, self.raised)
         if not solution.success:
             raise SolverError(solution.status)
         if solution.cost > self.highest:
-            raise CostlyError(COSTLY)
+            raise SolverError(COSTLY)
         change, least, old = self.change, self.least, self.solution
         if [s.intervals for s in old.stages] != [s.intervals for s in self.stages]:
             # What raised limits cost later is no reason for more intervals: phases 2 and 3 of query
@@ -343,7 +340,7 @@ class TimeIterate:
             change = abs(solution.cost - old.cost) / self.search.measure(solution.cost)
             least = solution.cost
         solved = replace(self, solution=solution, stages=solution.stages, change=change)
-        return replace(solved, least=least, is_solved=True)
+        return replace(solved, least=least)
 
     def adapt(self) -> TimeIterate | None:
         """With finer intervals, raised limits and those of the formation that are violated."""
@@ -353,7 +350,7 @@ class TimeIterate:
         triples = zip(self.raised, self.misses, self.halvings, strict=True)
         raised = [limits.add(miss, SETTINGS.over).halve(mine) for limits, miss, mine in triples]
         refined = self.refined + self.is_coarse
-        return replace(self, stages=stages, raised=raised, is_solved=False, refined=refined)
+        return replace(self, stages=stages, raised=raised, refined=refined)
 
     def restart(self) -> None:
         """Without a solution there is no other iterate."""
@@ -601,26 +598,23 @@ def find_misses(
 def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Array:
     """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
     formation, count, epsilon = stage.formation, len(check.places), search.problem.epsilon
-    ranges, length = search.options.ranges, search.source.scene.scales.length
-    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
+    units = {"m": search.source.scene.scales.length}
+    radii = {
+        parameter.name: radius / units.get(parameter.unit, 1.0)
+        for parameter in PARAMETERS
+        if (radius := search.options.ranges.get(parameter.name, 0.0)) and parameter.unit != "s"
+    }
     limits = make_limits(formation, epsilon)
-    sides, total = limits.sides[0], np.zeros((count, len(limits.low)))
-    names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
+    total, names = np.zeros((count, len(limits.low))), [*radii]
     if names:
-        forces = limits.of(PRESS, CONE)
+        forces, samples = limits.of(PRESS, CONE), check.samples
         rows = limits.rows[forces][:, : formation.n_constraints]
         signs = (np.broadcast_to(part, (count, *part.shape)) for part in stage.directions)
-        slopes = find_slopes_at(formation, check.samples, Directions(*signs), names)
-        c_t = check.samples.c_t[:, list(formation.rolling_rows)]
-        c = np.hstack([check.samples.c_n, c_t])
-        for k, name in enumerate(names):
-            change = slopes[:, :, k] @ rows.T
-            edges = find_edges(formation, rows, name)
-            if edges is not None:
-                change = change + c @ edges.T - epsilon * edges.sum(axis=1)
-            radius = ranges[name] / (length if name in lengths else 1.0)
-            total[:, forces] += radius * np.abs(change)
-    return np.asarray(total[:, sides] / limits.scales[sides])
+        slopes = find_slopes_at(formation, samples, Directions(*signs), names)[..., None]
+        c = np.hstack([samples.c_n, samples.c_t[:, list(formation.rolling_rows)]])[..., None]
+        changes = find_variations(formation, rows, names, slopes, c, epsilon)[..., 0]
+        total[:, forces] = np.abs(changes) @ [*radii.values()]
+    return np.asarray(total[:, limits.sides[0]] / limits.side_scales)
 
 
 def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:

@@ -260,14 +260,9 @@ def in_own_units(problem: Problem) -> Problem:
         problem,
         scene=scene,
         epsilon=problem.epsilon / scales.force,
-        start=scale_state(problem.start, scales),
+        start=problem.start / unit_lengths(scales),
         phases=tuple(phases),
     )
-
-
-def scale_state(z: Array, scales: Scales) -> Array:
-    """Configurations, shape (..., 5), in own units."""
-    return np.asarray(z / unit_lengths(scales))
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:

@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -588,17 +587,6 @@ def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> Fl
     return np.array(flags)[owners]
 
 
-class _Piece(NamedTuple):
-    """An interval as a part of a period: phase, stage, period, share of the stage, unknowns."""
-
-    phase: int
-    stage: int
-    period: int
-    share: float
-    h: int
-    tau: Indices
-
-
 def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
     """Durations of control periods, and their torques, constant or linear and continuous.
 
@@ -606,37 +594,35 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
     """
     scene, duration = stages[0].formation.scene, stages[0].period
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
-    pieces = [
-        _Piece(stage.phase, k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau)
-        for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
-        for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
-    ]
+    # Of each interval: its stage, period and share of the stage, and its unknowns.
+    owners = [k for k, stage in enumerate(stages) for _ in stage.periods]
+    periods = [period for stage in stages for period in stage.periods]
+    share = np.concatenate([stage.guess.fractions for stage in stages])
+    h, tau = (np.concatenate([getattr(part, name) for part in layouts]) for name in ("h", "tau"))
     first: Indices | None = None  # durations of the parts of the first period that is not a last
-    for phase in (list(group) for _, group in groupby(pieces, key=attrgetter("phase"))):
-        last = phase[-1].period
-        for period, group in groupby(phase, key=attrgetter("period")):
+    for _, intervals in groupby(range(len(h)), key=lambda i: stages[owners[i]].phase):
+        phase = list(intervals)
+        last = periods[phase[-1]]
+        for period, group in groupby(phase, key=periods.__getitem__):
             parts, least = list(group), 0.0 if period == last else duration
-            spans = np.array([piece.h for piece in parts])
             if duration or first is not None:
                 low = least if duration or period != last else -np.inf
                 whole = rows.linear(1, low=low, high=duration)
-                rows.add_entries(whole, spans, 1.0)
+                rows.add_entries(whole, h[parts], 1.0)
                 if not duration:
                     rows.add_entries(whole, first, -1.0)
             elif period != last:
-                first = spans
+                first = h[parts]
             for one, other in pairwise(parts):
-                if one.stage == other.stage:
-                    even, size = rows.linear(1), one.share + other.share
-                    rows.add_entries(even, np.array([one.h]), other.share / size)
-                    rows.add_entries(even, np.array([other.h]), -one.share / size)
+                if owners[one] == owners[other]:
+                    weights = np.array([share[other], -share[one]]) / (share[one] + share[other])
+                    rows.add_entries(rows.linear(1), h[[one, other]], weights)
                 if linear:
-                    slopes = {"before": one.tau.ravel(), "after": other.tau.ravel()}
-                    slopes |= {"h": np.array([one.h]), "coming": np.array([other.h])}
-                    rows.add_copies(slope_kernel(), slopes)
-        for before, after in pairwise(phase):
-            if not goes_on and (linear or before.period == after.period):
-                rows.add_equal(after.tau[0], before.tau[-1], 1 / scene.torque_limit)
+                    slopes = {"before": tau[one].ravel(), "after": tau[other].ravel()}
+                    rows.add_copies(slope_kernel(), slopes | {"h": h[[one]], "coming": h[[other]]})
+        for one, other in pairwise(phase):
+            if not goes_on and (linear or periods[one] == periods[other]):
+                rows.add_equal(tau[other, 0], tau[one, -1], 1 / scene.torque_limit)
 
 
 def find_bounds(

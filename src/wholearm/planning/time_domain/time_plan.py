@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, islice, pairwise, takewhile
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +35,16 @@ from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase, Problem
 from ...results.report import Transition
 from ...results.trajectory import Motion
+from ..explain import (
+    Replan,
+    change_limit,
+    explain_stages,
+    list_shortfalls,
+    refuse,
+    refuse_motors,
+    refuse_paths,
+    require_hold_at_ends,
+)
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops
 from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
@@ -52,11 +62,8 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, make_scheme, resample, to_si, unit_of, with_controls
+from .stage import Scheme, Stage, resample, to_si, unit_of
 from .time_motion import TimeMotion, make_phase_motions
-
-if TYPE_CHECKING:
-    from ..explain import Replan
 
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
 # a pentagon, 0.369 s from the modes of a plan of 0.094 s (the test of given modes)
@@ -101,9 +108,7 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    from ..explain import change_limit, refuse
-
-    search = TimeSearch.of(problem, options, phases, duration, to_go, ample, only_begin)
+    search = TimeSearch(problem, options, phases, duration, to_go, ample, only_begin)
     guesses = Guesses(search, z)
     solution: TimeSolution | None = None
     if begun:
@@ -192,8 +197,6 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     ------
     InfeasibleError  if that does not lead to the limits; it names those of the last plan
     """
-    from ..explain import refuse_motors, require_hold_at_ends
-
     require_hold_at_ends(search, free)
     plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
     stages = own = adapt_ends(free, search)
@@ -202,9 +205,10 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
         """Whether there is a solution with motors so many times as quick, from the last one."""
         nonlocal stages
         tried.append(factor)
-        scene = search.problem.scene.quicken(factor)
-        quick = replace(search, problem=replace(search.problem, scene=scene))
-        solution = quick.solve(link([stage.move_to(scene) for stage in stages]), most=most)
+        scene = search.source.scene.quicken(factor)
+        quick = replace(search, source=replace(search.source, scene=scene))
+        moved = link([stage.move_to(quick.problem.scene) for stage in stages])
+        solution = quick.solve(moved, most=most)
         if solution.success:
             plans.append((factor, quick, solution))
             stages = solution.stages
@@ -266,7 +270,7 @@ def try_phases(
     stopped       plans of the phases, each from rest to rest, as the only guess
     """
     rough = replace(options, mode_search=False)
-    search = TimeSearch.of(problem, rough, phases, only_begins=True)
+    search = TimeSearch(problem, rough, phases, only_begins=True)
     guesses = Guesses(search, z)
     listed: Iterable[Guess] = guesses.every(goal)
     if stopped:
@@ -403,11 +407,9 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
     ------
     InfeasibleError  if none is found; it names a shorter period with which one is
     """
-    from ..explain import refuse_motors
-
-    scene, options = search.problem.scene, search.options
+    scene = search.problem.scene
     controls = 2 if scene.control_hold == "linear" else 1
-    held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
+    held = replace(search, controls=controls)
 
     def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
         # Phases 2 to 4 of a pentagon take 70 at 2 ms. More than from a guess, so that a solve that
@@ -477,11 +479,7 @@ def count_periods(stages: Sequence[Stage], period: float) -> list[int]:
 
 
 def cut_periods(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    period: float,
-    stretch: float = 1.0,
-    equal: bool = False,
+    stages: Sequence[Stage], scheme: Scheme, period: float, stretch: float, equal: bool
 ) -> list[Stage]:
     """Stages whose intervals are periods or parts of them, stretched in time.
 
@@ -501,8 +499,7 @@ def cut_periods(
             edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
             numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
             part = resample(stage.guess, scheme, (edges - start) / (stop - start))
-            longer = replace(stage, guess=with_controls(part, scheme.controls))
-            longer = longer.stretch((stop - start) / stage.guess.duration)
+            longer = replace(stage, guess=part).stretch((stop - start) / stage.guess.duration)
             cut.append(replace(longer, periods=numbers, period=0.0 if equal else period))
             start = stop
     return cut
@@ -573,8 +570,7 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         return
     free = tuple(replace(p, until=replace(p.until, pins=())) for p in search.source.phases)
     problem, phases = replace(search.source, phases=free), [free[p.index] for p in search.phases]
-    given = search.options, phases, search.duration, None, search.ample, True
-    free_search = replace(TimeSearch.of(problem, *given), tried=search.tried)
+    free_search = replace(search, source=problem, phases=phases, to_go=None, only_begins=True)
     coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
     if coarse is None:
         return
@@ -587,10 +583,8 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
     """Plan from motions of least violation, or the error that says why there is none."""
-    from ..explain import explain_stages, list_shortfalls, refuse_paths
-
     short, missed = list[list[Stage]](), list[Shortfall]()
-    soft = search.aiming(Objective.ELASTIC)
+    soft = search.soften()
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
         elastic = soft.solve(guess.stages)
         missed = list_shortfalls(search, elastic.stages)
