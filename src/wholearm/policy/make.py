@@ -557,42 +557,57 @@ def _follow(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array
     return s, a, v**2, np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA])
 
 
-def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str, Array]:
-    """Arrays of `CurveLaw`; levels, torques and normal forces are at both ends of intervals."""
-    rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
-    point = curve.evaluate(rows.s)
-    mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
-    c_n = inverse(formation, *point[:3], mean, point.kinematics).of_c[:, : formation.n_contacts]
-    tables = rows.levels, rows.torque, c_n
-    levels, torque, forces = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
-    # Of equal limits of an interval one is enough.
-    equal = (levels[:, :, :, None] == levels[:, :, None]).all(axis=(1, 4))
-    levels.swapaxes(1, 2)[np.tril(equal, -1).any(axis=2)] = UNLIMITED
+def _tabulate_curve(pieces: Sequence[ReferencePiece], push: Array, keeps: bool) -> dict[str, Array]:
+    """Arrays of `CurveLaw` for phases in which contacts go on under other names.
+
+    Levels, torques and normal forces are at both ends of intervals.
+    """
+    starts = np.cumsum([0.0, *(piece.rows.s[-1] for piece in pieces)])
+    most, parts = max(piece.rows.slack.shape[1] for piece in pieces), list[dict[str, Array]]()
+    for piece, start in zip(pieces, starts, strict=False):
+        rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
+        point = curve.evaluate(rows.s)
+        mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
+        forces = inverse(formation, *point[:3], mean, point.kinematics)
+        levels = np.tile(UNLIMITED, (len(rows.s), most, 1))
+        levels[:, : rows.slack.shape[1]] = rows.levels
+        tables = levels, rows.torque, forces.of_c[:, : formation.n_contacts]
+        levels, torque, c_n = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
+        # Of equal limits of an interval one is enough.
+        equal = (levels[:, :, :, None] == levels[:, :, None]).all(axis=(1, 4))
+        levels.swapaxes(1, 2)[np.tril(equal, -1).any(axis=2)] = UNLIMITED
+        # The last node of the piece before is the first one.
+        first = int(bool(parts))
+        nodes = {"s": start + rows.s, "theta": point.z[:, 3:], "b": piece.b}
+        spans = {"levels": levels, "torque": torque, "forces": c_n}
+        parts.append({name: table[first:] for name, table in nodes.items()})
+        parts[-1] |= {name: table[..., COLUMNS] for name, table in spans.items()}
     return {
-        "starts": np.zeros(1),
-        "s": rows.s,
-        "theta": point.z[:, 3:],
-        "b": piece.b,
-        "levels": levels[..., COLUMNS],
-        "torque": torque[..., COLUMNS],
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        "starts": starts[:-1],
         "push": push,
-        "passes": np.array([piece.passes]),
+        "passes": np.array([pieces[-1].passes]),
         "keeps": np.array([float(keeps)]),
-        "forces": forces[..., COLUMNS],
     }
 
 
-def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array]:
-    """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
-    two = {**two, **{name: one["s"][-1] + two[name] for name in ("s", "starts")}}
-    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("s", "theta", "b")}
-    for name in ("starts", "torque", "forces"):
-        joined[name] = np.concatenate([one[name], two[name]])
-    parts = one["levels"], two["levels"]
-    most = max(part.shape[2] for part in parts)
-    missing = [np.tile(UNLIMITED, (len(p), 2, most - p.shape[2], 1)) for p in parts]
-    wide = [np.concatenate(pair, axis=2) for pair in zip(parts, missing, strict=True)]
-    return {**two, **joined, "levels": np.concatenate(wide)}
+def _find_push(
+    problem: Problem, plan: Trajectory, phase: Phase, pieces: Mapping[int, ReferencePiece]
+) -> tuple[Array, bool]:
+    """Torques at the end of a phase along a curve, and whether they are held until the next one."""
+    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+    push, hold = plan.tau[last], None
+    if not np.isnan(plan.c_n[last]).all():
+        hold = hold_end(problem, phase, pieces[phase.index].curve.end)
+        push = push if hold is None else hold
+    # Friction of the joints decides on rest where torques are not much larger.
+    keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
+    if hold is not None and phase.index + 1 in pieces:
+        # Or if torques of the next motion press too little with no speed wanted at its start.
+        # Case: new polygon 34, phase 10.
+        levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
+        keeps |= not find_internal_force(levels, still, still)[0][0] > 0
+    return push, keeps
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -670,50 +685,37 @@ def make_policy(
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
-    starts, given, phases = plan.phase_starts, problem.table, problem.phases
+    durations, given, phases = np.diff(plan.phase_starts), problem.table, problem.phases
     if reserve and planner is not None:
         problem, plan = replan(planner, problem, plan)
     problem = pass_renamed(problem)
-    blocks = split_blocks(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
     pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    for block in blocks:
-        for phase in block:
-            lasts = float(np.diff(starts)[phase.index])
-            about.append({"number": phase.number, "plan": lasts, "duration": lasts, "share": 0.0})
-        if block[0].index not in pieces:
+    for block in split_blocks(problem):
+        entries = [{"number": p.number, "plan": float(durations[p.index])} for p in block]
+        if block[0].index in pieces:
+            run = list[ReferencePiece]()
+            for phase, entry in zip(block, entries, strict=True):
+                piece = pieces[phase.index]
+                run.append(piece)
+                if phase.end is not End.SMOOTH:
+                    tables.append(_tabulate_curve(run, *_find_push(problem, plan, phase, pieces)))
+                    run = []
+                lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
+                lasts += 0.0 if piece.passes else settings.dwell + delay
+                entry |= {"duration": lasts, "share": piece.share, "reserves": piece.reserves}
+                # The plan goes on in motion there.
+                planned_end = phases[phase.index].end
+                entry["stops"] = phase.end is End.REST and planned_end is not End.REST
+                entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
+        else:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
-            for entry, span in zip(about[-len(block) :], np.diff(ends).tolist(), strict=True):
-                entry["duration"] = span
-            about[-1]["duration"] += settings.dwell + delay
-            continue
-        goes_on = False
-        for phase, entry in zip(block, about[-len(block) :], strict=True):
-            piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
-            push, hold = plan.tau[last], None
-            if not np.isnan(plan.c_n[last]).all():
-                hold = hold_end(problem, phase, piece.curve.end)
-                push = push if hold is None else hold
-            # Friction of the joints decides on rest where torques are not much larger.
-            keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
-            if hold is not None and phase.index + 1 in pieces:
-                # Or if torques of the next motion press too little with no speed wanted at its
-                # start. Case: new polygon 34, phase 10.
-                levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
-                keeps |= not find_internal_force(levels, still, still)[0][0] > 0
-            table = _tabulate_curve(piece, push, keeps)
-            tables.append(_join(tables.pop(), table) if goes_on else table)
-            goes_on = phase.end is End.SMOOTH
-            lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
-            entry.update(duration=lasts, share=piece.share, reserves=piece.reserves)
-            # The plan goes on in motion there.
-            planned_end = phases[phase.index].end
-            entry["stops"] = phase.end is End.REST and planned_end is not End.REST
-            entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
-            if not piece.passes:
-                entry["duration"] += settings.dwell + delay
+            ends[-1] += settings.dwell + delay
+            for entry, lasts in zip(entries, np.diff(ends).tolist(), strict=True):
+                entry |= {"duration": lasts, "share": 0.0}
+        about += entries
     duration = sum(phase["duration"] for phase in about)
     whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:
