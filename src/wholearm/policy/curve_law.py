@@ -24,7 +24,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, inf, isfinite, sqrt
-from operator import mul
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -180,7 +179,7 @@ class CurveLaw:
         # Much slower than the reference the motion does not brake with it.
         if planned < 0.0 and v < 0.5 * wanted:
             planned = 0.0
-        self.sum = _clip(self.sum + self.memory * error, settings.most)
+        self.sum = min(max(self.sum + self.memory * error, -settings.most), settings.most)
         a = planned + self.gain * error + self.sum + self.drive
         # Faster than 0.4 of the touching speed, so that no friction reverses while braking.
         slowest = (0.4 * settings.touch - (v - half * self.a)) / (settings.period + settings.delay)
@@ -312,7 +311,7 @@ class CurveLaw:
             if low <= high:
                 internal += self.sensing.shift((j, share, v, a, internal), low, high)
         first, second = (moving + by * internal for moving, by in tau)
-        return _clip(first, one), _clip(second, two)
+        return min(max(first, -one), one), min(max(second, -two), two)
 
     def _press(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques at the end, until the joints have been at rest for the dwell time."""
@@ -332,11 +331,6 @@ class CurveLaw:
         self.rested = self.rested + settings.period if abs(v) < settings.still else 0.0
         self.over = self.rested > dwell + settings.delay
         return tau
-
-
-def _clip(value: float, most: float) -> float:
-    """The nearest number from -most to most."""
-    return min(max(value, -most), most)
 
 
 def _evaluate(rows: Ends, share: float, v: float) -> list[Row]:
@@ -461,40 +455,47 @@ class MotionLaw:
             self.over = self.pushes and self.rested > settings.dwell + settings.delay
             if self.pushes and self.after is not None:
                 return self.after.hold(theta, rates)
-        fast = [rate - at for rate, at in zip(rates, self._look(self.rates, now), strict=True)]
-        angles = zip(theta, self._look(self.theta, now), fast, strict=True)
-        off = [angle - at + lead * speed for angle, at, speed in angles]
-        if now < self.end:
-            tau, gain = self._look(self.tau, now + lead), self.gain[self._locate(now + lead)[0]]
-        elif self.pushes:
-            tau, gain, off = self.push, self.gain[-1], self._hold(off)
-        elif any(self.approach):
-            tau, gain, beyond = self.tau[-1], self.gain[-1], min(now - self.end, LAW.reach)
-            off = [error - beyond * speed for error, speed in zip(off, self.approach, strict=True)]
-        else:
-            tau, gain, off = self.push, self.gain[-1], [0.0, 0.0]
+        k, share = self._locate(now)
+        (p, q), (u, w) = self.theta[k], self.theta[k + 1]
+        (f, g), (c, d) = self.rates[k], self.rates[k + 1]
+        fast_one = rates[0] - f - share * (c - f)
+        fast_two = rates[1] - g - share * (d - g)
+        one = theta[0] - p - share * (u - p) + lead * fast_one
+        two = theta[1] - q - share * (w - q) + lead * fast_two
+        k, share = self._locate(now + lead)
         torques = []
-        for planned, row, most in zip(tau, gain, settings.limit, strict=True):
-            feedback = _clip(sum(map(mul, row, (*off, *fast))), LAW.share * most)
-            torques.append(_clip(planned - feedback, most))
+        beyond = min(max(now - self.end, 0.0), LAW.reach)
+        closes = self.pushes or (now >= self.end and not any(self.approach))
+        if self.pushes:
+            one, two = self._hold(one, two)
+        elif closes:
+            one = two = 0.0
+        else:
+            one, two = one - beyond * self.approach[0], two - beyond * self.approach[1]
+        for row in (0, 1):
+            first, after = self.tau[k][row], self.tau[k + 1][row]
+            if now >= self.end:
+                first = after = (self.push if closes else self.tau[-1])[row]
+            a, b, c, d = self.gain[-1 if now >= self.end else k][row]
+            feedback = a * one + b * two + c * fast_one + d * fast_two
+            most = settings.limit[row]
+            feedback = min(max(feedback, -LAW.share * most), LAW.share * most)
+            tau = first + share * (after - first) - feedback
+            torques.append(min(max(tau, -most), most))
         return torques[0], torques[1]
 
-    def _hold(self, off: Sequence[float]) -> list[float]:
+    def _hold(self, one: float, two: float) -> tuple[float, float]:
         """Angle errors along displacements that are free at the end, once at rest plus integrals.
 
         Those across them are errors of geometry.
         """
-        free = [0.0, 0.0]
-        for k, way in enumerate(self.ways):
-            along = sum(map(mul, way, off))
-            self.left[k] += 30.0 * self.settings.period * along if self.over else 0.0
-            free = [f + part * (along + self.left[k]) for f, part in zip(free, way, strict=True)]
-        return free
-
-    def _look(self, rows: Sequence[Sequence[float]], t: float) -> list[float]:
-        """Values at a time, between samples."""
-        k, share = self._locate(t)
-        return [at + share * (after - at) for at, after in zip(rows[k], rows[k + 1], strict=True)]
+        free_one = free_two = 0.0
+        for k, (p, q) in enumerate(self.ways):
+            off = p * one + q * two
+            self.left[k] += 30.0 * self.settings.period * off if self.over else 0.0
+            off += self.left[k]
+            free_one, free_two = free_one + p * off, free_two + q * off
+        return free_one, free_two
 
     def _locate(self, t: float) -> tuple[int, float]:
         """Sample before a time, and the share of the interval after it."""
