@@ -38,7 +38,7 @@ from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_b
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.policy.make import make_rows
+from wholearm.policy import make
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.scene.model import Friction
 from wholearm.search.edges import BorderEdge, estimate_duration, time_parts
@@ -248,20 +248,20 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     plain = measure(EPSILON)
     s = np.linspace(0.2, 0.8, 7) * curve.length
     motion = np.full(7, 2.0), np.full(7, 0.5), np.full(7, 3.0)
-    before = make_rows(curve, s, motion)
+    before = make.make_rows(curve, s, motion)
     request.getfixturevalue("motors")
     # Limits of cells are kept by scene and epsilon.
     driven = measure(EPSILON + 1e-9)
     assert np.isfinite(plain).all() and (driven > 1.001 * plain).all(), (plain, driven)
     # Policies: the limit is one of torques and speeds, at both ends.
-    after, point = make_rows(curve, s, motion), curve.evaluate(s)
-    rows = after.slack @ stack_motion(*motion)[..., None]
+    after, point = make.make_rows(curve, s, motion), curve.evaluate(s)
+    rows = after.levels @ stack_motion(*motion)[..., None]
     droop = DROOP * formation.scene.scales.torque * formation.scene.scales.time
     tau = (after.torque @ stack_motion(*motion)[..., None])[..., 0]
     drive = tau + droop * point.z_s[:, 3:] * np.sqrt(0.5)
-    assert after.slack.shape[1] == before.slack.shape[1] + 4
+    assert after.levels.shape[1] == before.levels.shape[1] + 4
     for sign in (-1, 1):
-        for column in (formation.scene.torque_limit + sign * drive).T:
+        for column in (1 + sign * drive / formation.scene.torque_limit).T / make.SETTINGS.spare:
             assert np.abs(rows[..., 0] - column[:, None]).max(axis=0).min() < 1e-12
     # Predictions: the internal force that presses most is less free.
     forces = inverse(formation, *point[:3], directions_of(curve, np.zeros(7, int)))

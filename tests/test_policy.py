@@ -465,11 +465,11 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
         at = formation.evaluate(point.z, z_dot)
         least = np.minimum(least, forward(formation, at, z_dot, tau, directions)[1])
     rows, _, _ = within.at((a, b, squeeze))
-    found = np.einsum("nmq,nq->nm", rows.slack[:, :4], known)
-    assert found == pytest.approx(least, abs=1e-9)
+    unit = max(make.SETTINGS.least * ranged.scene.scales.force, ranged.epsilon)
+    found = unit * np.einsum("nmq,nq->nm", rows.levels[:, : rows.presses], known).reshape(3, -1, 4)
+    assert found[:, 0] == pytest.approx(least, abs=1e-9)
     # Other rows are of corners that are worst at other squeezes.
-    others = np.einsum("nmq,nq->nm", rows.slack[:, : rows.presses], known)
-    assert (others.reshape(3, -1, 4) > least[:, None] - 1e-9).all()
+    assert (found > least[:, None] - 1e-9).all()
 
 
 def test_contacts_are_kept_in_corners_of_the_ranges(
@@ -506,7 +506,7 @@ def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
 
     def measure(widths: dict[str, float]) -> np.ndarray:
         rows, _, _ = make.find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)
-        return np.asarray(rows.slack[0, :4] @ known)
+        return np.asarray(rows.levels[0, :4] @ known)
 
     # Forces are affine in torques: what a gain takes away is in proportion to it.
     exact, off = measure({}), measure({"gain1": 0.02})

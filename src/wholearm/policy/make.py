@@ -100,16 +100,10 @@ class CurveLimitRows(NamedTuple):
 
     s: Array  # (n,) [m]
     torque: Array  # (n, 2, 5) [N m]
-    # (n, m, 5) [N, N m]: distances from limits: of forces with friction before, then after the
-    # nearest reversal; of torques
-    slack: Array
-    unit: Array  # (n, m) [N, N m]: margin at level 1
+    # (n, m, 5): distances from limits over their margins: of forces with friction before, then
+    # after the nearest reversal; of torques
+    levels: Array
     presses: int  # how many of the m are of forces
-
-    @property
-    def levels(self) -> Array:
-        """Limits over their margins, shape (n, m, 5)."""
-        return np.asarray(self.slack / self.unit[..., None])
 
 
 def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
@@ -121,15 +115,11 @@ def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
     formation, point, torque = after.formation, after.evaluate(np.zeros(1)), rows.torque[-1:]
     directions = directions_of(after, np.zeros(1, dtype=np.int64))
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    limits, size = split_limits(formation)[0], len(rows.s)
+    limits = split_limits(formation)[0]
     slack = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
-    beyond = np.tile(UNLIMITED, (size, slack.shape[1], 1))
-    beyond[-1] = slack[0]
-    unit = np.tile(SETTINGS.least * limits.side_scales, (size, 1))
-    return rows._replace(
-        slack=np.concatenate([rows.slack, beyond], axis=1),
-        unit=np.concatenate([rows.unit, unit], axis=1),
-    )
+    beyond = np.tile(UNLIMITED, (len(rows.s), slack.shape[1], 1))
+    beyond[-1] = slack[0] / (SETTINGS.least * limits.side_scales)[:, None]
+    return rows._replace(levels=np.concatenate([rows.levels, beyond], axis=1))
 
 
 def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
@@ -158,6 +148,13 @@ def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Ar
     return limits.find_slack_rows(find_value_rows(limits, PathForces(c, torque), rates))
 
 
+def level_torques(limits: LimitSet, torque: Array, rates: Array) -> Array:
+    """Distances of torques, (n, 2, 5), from their limits over their margins, shape (n, m, 5)."""
+    none = np.zeros((len(torque), limits.rows.shape[1] - 4, 5))
+    slack = measure_slack(limits, none, torque, rates)
+    return slack / (SETTINGS.spare * limits.side_scales)[:, None]
+
+
 def of_forces(limits: LimitSet) -> Array:
     """Derivatives of the slack of limits by contact forces, shape (m, n_c + R)."""
     rows, signs, _ = limits.sides
@@ -170,24 +167,22 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     mean, *sides = blend_directions(curve, s, speed * SETTINGS.near)
     torque, late = (find_torques(curve, s - late * speed, mean) for late in (0.0, SETTINGS.late))
     (contact, joint), rates = split_limits(formation), point.z_s[:, 3:]
-    slack, unit = [], []
+    levels = list[Array]()
     for side in sides:
         forces = inverse(formation, *point[:3], side, point.kinematics)
         c = respond(forces, torque)[0]
-        slack.append(measure_slack(contact, c, torque, rates))
+        slack = measure_slack(contact, c, torque, rates)
         state = Sensitivity.of_curve(formation, point, side, forces)
         changes = np.array([*DOUBTS.values()])[:, None] * state.find_slopes(tuple(DOUBTS))
         delay = respond(forces, late)[0] - c
         changes = np.append(changes, delay[:, :, None], axis=2)
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
         error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
-        unit.append(SETTINGS.least * contact.side_scales + error)
+        levels.append(slack / (SETTINGS.least * contact.side_scales + error)[..., None])
     before, after = map(np.hstack, sides)
-    slack[1][(before == after).all(axis=1)] = UNLIMITED
-    slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
-    unit.append(np.tile(SETTINGS.spare * joint.side_scales, (len(s), 1)))
-    table, units = (np.concatenate(parts, axis=1) for parts in (slack, unit))
-    return CurveLimitRows(s, torque, table, units, 2 * slack[0].shape[1])
+    levels[1][(before == after).all(axis=1)] = UNLIMITED
+    levels.append(level_torques(joint, torque, rates))
+    return CurveLimitRows(s, torque, np.concatenate(levels, axis=1), 2 * levels[0].shape[1])
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
@@ -202,7 +197,7 @@ def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
 
 
 class Corners(NamedTuple):
-    """Limits at n places in k corners, of the nominal (1, a, b, s', internal force)."""
+    """Levels of limits at n places in k corners, of the nominal (1, a, b, s', internal force)."""
 
     rows: Array  # (k, n, m, 5)
     moves: Array  # (k, n, 5): actual acceleration s''
@@ -235,8 +230,9 @@ def find_corners(
     side: Directions,
     torques: tuple[Array, Array, Array],
     widths: Mapping[str, float],
+    unit: Array,
 ) -> Corners:
-    """Limits of forces in the corners of ranges with half `widths`.
+    """Limits of forces over margins, `unit` (m,) [N], in the corners of ranges with half `widths`.
 
     Torques, (n, 2, 5) each, are the nominal ones, delayed ones, and the derivative by s.
     """
@@ -258,8 +254,8 @@ def find_corners(
             moved = torque + state.find_shifts(name)[:, None, None] * slope
             slopes = slopes + respond(nominal, moved)[0] - respond(nominal, torque)[0]
         swings.append(widths[name] * slopes)
-    of_c = of_forces(split_limits(formation)[0])
-    return Corners(np.array(rows), np.array(moves), of_c @ np.array(swings))
+    of_c, margin = of_forces(split_limits(formation)[0]), unit[:, None]
+    return Corners(np.array(rows) / margin, np.array(moves), of_c / margin @ np.array(swings))
 
 
 def list_scenes(scene: Scene, widths: Mapping[str, float]) -> tuple[Scene, ...]:
@@ -276,13 +272,12 @@ class Within(NamedTuple):
 
     s: Array  # (n,) [m]
     torque: Array  # (n, 2, 5) [N m]
-    left: Array  # (n, l, 5) [N m]: distances of torques from their limits
+    left: Array  # (n, l, 5): levels of torques
     sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
     same: Array  # (n,): where these are equal
-    unit: Array  # (m + l,): margins at level 1, of forces and torques
 
     def at(self, motion: PathMotion) -> tuple[CurveLimitRows, Array, Array]:
-        """The law's limits near a motion; those of the reference, and their margins."""
+        """The law's limits near a motion; levels of the reference, and the least of each, (m,)."""
         # With its internal force, and with the least and largest one within torques.
         a, b, internal = motion
         ends = PathLimits(self.left, b).find_internal_force_range(a, b)
@@ -290,15 +285,13 @@ class Within(NamedTuple):
         motions = [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
         forces = self._pick(self.sides, motions)
         closed = self._pick([side.close(self.left) for side in self.sides], motions)
-        slack = np.concatenate([forces, self.left], axis=1)
-        press, drive = np.split(self.unit, [-self.left.shape[1]])
-        copies, n = forces.shape[1] // len(press), len(self.s)
-        table = np.tile(np.append(np.tile(press, copies), drive), (n, 1))
-        rows = CurveLimitRows(self.s, self.torque, slack, table, forces.shape[1])
-        press, drive = SETTINGS.kept * press, SETTINGS.authority * drive
+        levels = np.concatenate([forces, self.left], axis=1)
+        rows = CurveLimitRows(self.s, self.torque, levels, forces.shape[1])
+        count, drives = self.sides[0].rows.shape[2], self.left.shape[1]
+        press, drive = np.full(count, SETTINGS.kept), np.full(drives, SETTINGS.authority)
         again = np.tile(np.append(press, drive), 2 * len(motions))
-        wanted = np.concatenate([np.tile(press, copies), drive, again])
-        return rows, np.concatenate([slack, closed], axis=1), np.tile(wanted, (n, 1))
+        wanted = np.concatenate([np.tile(press, 2 * len(motions)), drive, again])
+        return rows, np.concatenate([levels, closed], axis=1), wanted
 
     def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[PathMotion]) -> Array:
         """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
@@ -320,15 +313,12 @@ def find_within(
     nominal, step = find_torques(curve, s, mean), 1e-4 * curve.length
     before, after = (find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
     torques = nominal, find_torques(curve, late, mean), (after - before) / (2 * step)
-    corners = [find_corners(formation, point, side, torques, widths) for side in sides]
     contact, joint = split_limits(formation)
-    none = np.zeros((len(s), formation.n_constraints, 5))
-    left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
-    forces = np.maximum(SETTINGS.least * contact.side_scales, least)
-    unit = np.concatenate([forces, SETTINGS.spare * joint.side_scales])
+    unit = np.maximum(SETTINGS.least * contact.side_scales, least)
+    corners = [find_corners(formation, point, side, torques, widths, unit) for side in sides]
     one, other = map(np.hstack, sides)
-    same = (one == other).all(axis=1)
-    return Within(s, nominal, left, (corners[0], corners[1]), same, unit)
+    left, same = level_torques(joint, nominal, point.z_s[:, 3:]), (one == other).all(axis=1)
+    return Within(s, nominal, left, (corners[0], corners[1]), same)
 
 
 class ReferencePiece(NamedTuple):
@@ -437,9 +427,9 @@ def _trace(
         rows = find_rows((*motion, internal))
         for _ in range(2 if factor < 1.0 else 0):
             rows = find_rows((*motion, find_internal_force(rows.levels, *motion)[1]))
-        wanted = size * rows.unit
-        wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
-        controllable_set = retime(s, rows.slack, wanted, motion[1], end)
+        wanted = np.full(rows.levels.shape[1], size)
+        wanted[rows.presses :] = SETTINGS.authority
+        controllable_set = retime(s, rows.levels, wanted, motion[1], end)
         share = float(controllable_set.share.min())
         if best is not None and share <= best[2]:
             break
@@ -457,7 +447,7 @@ def _trace(
 
 def retime(
     s: Array,
-    slack: Array,
+    levels: Array,
     reserve: Array,
     cap: Array,
     end: tuple[float, float] | None = None,
@@ -468,13 +458,13 @@ def retime(
     Parameters
     ----------
     s : (n,) [m]          nodes
-    slack : (n, m, 5)     limits at the nodes, as in `CurveLimitRows`
-    reserve : (n, m)      their margins
+    levels : (n, m, 5)    limits at the nodes, as in `CurveLimitRows`
+    reserve : (m,)        levels with a share of 1
     cap : (n,) [m^2/s^2]  largest b
     end : [m^2/s^2]       least and largest b at the last node; by default the last of `cap`
     parts                 upper limits of the share, tried where some interval has less
     """
-    limits, floor, end = PathLimits(slack, cap), SETTINGS.slowest * cap, end or (cap[-1], cap[-1])
+    limits, floor, end = PathLimits(levels, cap), SETTINGS.slowest * cap, end or (cap[-1], cap[-1])
     best: ControllableSet | None = None
     for part in (1.0, *parts):
         shares = [part, *(share for share in SETTINGS.shares if share < part)]
@@ -557,42 +547,57 @@ def _follow(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array
     return s, a, v**2, np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA])
 
 
-def _tabulate_curve(piece: ReferencePiece, push: Array, keeps: bool) -> dict[str, Array]:
-    """Arrays of `CurveLaw`; levels, torques and normal forces are at both ends of intervals."""
-    rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
-    point = curve.evaluate(rows.s)
-    mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
-    c_n = inverse(formation, *point[:3], mean, point.kinematics).of_c[:, : formation.n_contacts]
-    tables = rows.levels, rows.torque, c_n
-    levels, torque, forces = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
-    # Of equal limits of an interval one is enough.
-    equal = (levels[:, :, :, None] == levels[:, :, None]).all(axis=(1, 4))
-    levels.swapaxes(1, 2)[np.tril(equal, -1).any(axis=2)] = UNLIMITED
+def _tabulate_curve(pieces: Sequence[ReferencePiece], push: Array, keeps: bool) -> dict[str, Array]:
+    """Arrays of `CurveLaw` for phases in which contacts go on under other names.
+
+    Levels, torques and normal forces are at both ends of intervals.
+    """
+    starts = np.cumsum([0.0, *(piece.rows.s[-1] for piece in pieces)])
+    most, parts = max(piece.rows.levels.shape[1] for piece in pieces), list[dict[str, Array]]()
+    for piece, start in zip(pieces, starts, strict=False):
+        rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
+        point = curve.evaluate(rows.s)
+        mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
+        forces = inverse(formation, *point[:3], mean, point.kinematics)
+        levels = np.tile(UNLIMITED, (len(rows.s), most, 1))
+        levels[:, : rows.levels.shape[1]] = rows.levels
+        tables = levels, rows.torque, forces.of_c[:, : formation.n_contacts]
+        levels, torque, c_n = (np.stack([one[:-1], one[1:]], axis=1) for one in tables)
+        # Of equal limits of an interval one is enough.
+        equal = (levels[:, :, :, None] == levels[:, :, None]).all(axis=(1, 4))
+        levels.swapaxes(1, 2)[np.tril(equal, -1).any(axis=2)] = UNLIMITED
+        # The last node of the piece before is the first one.
+        first = int(bool(parts))
+        nodes = {"s": start + rows.s, "theta": point.z[:, 3:], "b": piece.b}
+        spans = {"levels": levels, "torque": torque, "forces": c_n}
+        parts.append({name: table[first:] for name, table in nodes.items()})
+        parts[-1] |= {name: table[..., COLUMNS] for name, table in spans.items()}
     return {
-        "starts": np.zeros(1),
-        "s": rows.s,
-        "theta": point.z[:, 3:],
-        "b": piece.b,
-        "levels": levels[..., COLUMNS],
-        "torque": torque[..., COLUMNS],
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        "starts": starts[:-1],
         "push": push,
-        "passes": np.array([piece.passes]),
+        "passes": np.array([pieces[-1].passes]),
         "keeps": np.array([float(keeps)]),
-        "forces": forces[..., COLUMNS],
     }
 
 
-def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array]:
-    """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
-    two = {**two, **{name: one["s"][-1] + two[name] for name in ("s", "starts")}}
-    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("s", "theta", "b")}
-    for name in ("starts", "torque", "forces"):
-        joined[name] = np.concatenate([one[name], two[name]])
-    parts = one["levels"], two["levels"]
-    most = max(part.shape[2] for part in parts)
-    missing = [np.tile(UNLIMITED, (len(p), 2, most - p.shape[2], 1)) for p in parts]
-    wide = [np.concatenate(pair, axis=2) for pair in zip(parts, missing, strict=True)]
-    return {**two, **joined, "levels": np.concatenate(wide)}
+def _find_push(
+    problem: Problem, plan: Trajectory, phase: Phase, pieces: Mapping[int, ReferencePiece]
+) -> tuple[Array, bool]:
+    """Torques at the end of a phase along a curve, and whether they are held until the next one."""
+    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+    push, hold = plan.tau[last], None
+    if not np.isnan(plan.c_n[last]).all():
+        hold = hold_end(problem, phase, pieces[phase.index].curve.end)
+        push = push if hold is None else hold
+    # Friction of the joints decides on rest where torques are not much larger.
+    keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
+    if hold is not None and phase.index + 1 in pieces:
+        # Or if torques of the next motion press too little with no speed wanted at its start.
+        # Case: new polygon 34, phase 10.
+        levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
+        keeps |= not find_internal_force(levels, still, still)[0][0] > 0
+    return push, keeps
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -670,50 +675,37 @@ def make_policy(
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
-    starts, given, phases = plan.phase_starts, problem.table, problem.phases
+    durations, given, phases = np.diff(plan.phase_starts), problem.table, problem.phases
     if reserve and planner is not None:
         problem, plan = replan(planner, problem, plan)
     problem = pass_renamed(problem)
-    blocks = split_blocks(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
     pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    for block in blocks:
-        for phase in block:
-            lasts = float(np.diff(starts)[phase.index])
-            about.append({"number": phase.number, "plan": lasts, "duration": lasts, "share": 0.0})
-        if block[0].index not in pieces:
+    for block in split_blocks(problem):
+        about += [{"number": p.number, "plan": float(durations[p.index])} for p in block]
+        entries = about[-len(block) :]
+        if block[0].index in pieces:
+            run = list[ReferencePiece]()
+            for phase, entry in zip(block, entries, strict=True):
+                piece = pieces[phase.index]
+                run.append(piece)
+                if phase.end is not End.SMOOTH:
+                    tables.append(_tabulate_curve(run, *_find_push(problem, plan, phase, pieces)))
+                    run = []
+                lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
+                lasts += 0.0 if piece.passes else settings.dwell + delay
+                entry |= {"duration": lasts, "share": piece.share, "reserves": piece.reserves}
+                # The plan goes on in motion there.
+                planned_end = phases[phase.index].end
+                entry["stops"] = phase.end is End.REST and planned_end is not End.REST
+                entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
+        else:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
-            for entry, span in zip(about[-len(block) :], np.diff(ends).tolist(), strict=True):
-                entry["duration"] = span
-            about[-1]["duration"] += settings.dwell + delay
-            continue
-        goes_on = False
-        for phase, entry in zip(block, about[-len(block) :], strict=True):
-            piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
-            push, hold = plan.tau[last], None
-            if not np.isnan(plan.c_n[last]).all():
-                hold = hold_end(problem, phase, piece.curve.end)
-                push = push if hold is None else hold
-            # Friction of the joints decides on rest where torques are not much larger.
-            keeps = bool((np.abs(push) < 10 * problem.scene.dry[3:]).all())
-            if hold is not None and phase.index + 1 in pieces:
-                # Or if torques of the next motion press too little with no speed wanted at its
-                # start. Case: new polygon 34, phase 10.
-                levels, still = pieces[phase.index + 1].rows.levels[:1], np.zeros(1)
-                keeps |= not find_internal_force(levels, still, still)[0][0] > 0
-            table = _tabulate_curve(piece, push, keeps)
-            tables.append(_join(tables.pop(), table) if goes_on else table)
-            goes_on = phase.end is End.SMOOTH
-            lasts = float(find_duration(piece.b, np.diff(piece.rows.s)))
-            entry.update(duration=lasts, share=piece.share, reserves=piece.reserves)
-            # The plan goes on in motion there.
-            planned_end = phases[phase.index].end
-            entry["stops"] = phase.end is End.REST and planned_end is not End.REST
-            entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
-            if not piece.passes:
-                entry["duration"] += settings.dwell + delay
+            ends[-1] += settings.dwell + delay
+            for entry, lasts in zip(entries, np.diff(ends).tolist(), strict=True):
+                entry |= {"duration": lasts, "share": 0.0}
     duration = sum(phase["duration"] for phase in about)
     whole = {"name": problem.name, "duration": duration, "phases": about, "problem": given}
     if ranges is not None and reserve:

@@ -12,23 +12,23 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
-from ..common.errors import InputError, require_number
+from ..common.errors import InputError, name_source, require_number, require_vector
 from ..common.files import read_arrays, require_ending, write_whole
 from .curve_law import CurveLaw, Law, LoopSettings, MotionLaw, Sensing
 
 FORMAT = 1  # Version of the files
-KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+KINDS: Mapping[str, Mapping[str, tuple[int | str, ...]]] = {
     "curve": {
-        "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5),
-        "torque": (-1, 2, 2, 5), "push": (2,), "passes": (1,), "forces": (-1, 2, -1, 5),
-        "keeps": (1,), "starts": (-1,),
+        "s": ("n",), "theta": ("n", 2), "b": ("n",), "levels": ("n - 1", 2, "any", 5),
+        "torque": ("n - 1", 2, 2, 5), "push": (2,), "passes": (1,),
+        "forces": ("n - 1", 2, "any", 5), "keeps": (1,), "starts": ("any",),
     },
     "motion": {
-        "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
-        "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2), "approach": (2,),
+        "starts": ("any",), "step": (1,), "theta": ("n", 2), "rates": ("n", 2), "tau": ("n", 2),
+        "gain": ("n", 2, 4), "push": (2,), "still": (1,), "ways": ("any", 2), "approach": (2,),
     },
 }  # fmt: skip
-"""Arrays of laws along a curve and over time, and their shapes; -1 is any."""
+"""Arrays of laws along a curve and over time, and their shapes; n is the number of places."""
 LATER = ("ways", "forces", "keeps", "starts", "approach")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 
@@ -228,68 +228,59 @@ class Policy(Result):
 
         InputError if the file cannot be read or is no policy.
         """
-        source = str(path)
-        meta = _read_meta(source, read_arrays(path, ["meta"]))
-        kinds = list(enumerate(meta["kinds"], start=1))
-        names = [f"{name}_{number}" for number, kind in kinds for name in KINDS[kind]]
-        arrays = read_arrays(path, names)
-        tables = [_read_tables(source, arrays, number, KINDS[kind]) for number, kind in kinds]
-        return Policy(tables, LoopSettings(**meta["pace"]), meta.get("about", {}))
+        with name_source(str(path)):
+            meta = _read_meta(read_arrays(path, ["meta"]))
+            kinds = list(enumerate(meta["kinds"], start=1))
+            names = [f"{name}_{number}" for number, kind in kinds for name in KINDS[kind]]
+            arrays = read_arrays(path, names)
+            tables = [_read_tables(arrays, number, KINDS[kind]) for number, kind in kinds]
+        return Policy(tables, meta["pace"], meta.get("about", {}))
 
 
-def _read_meta(source: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
+def _read_meta(arrays: Mapping[str, Any]) -> dict[str, Any]:
     try:
         meta = dict(json.loads(str(arrays["meta"])))
-        settings, kinds = meta["pace"], meta["kinds"]
-        valid = meta["policy"] == FORMAT and set(settings) == set(LoopSettings._fields)
+        pace, kinds = meta["pace"], meta["kinds"]
+        valid = meta["policy"] == FORMAT and set(pace) == set(LoopSettings._fields)
         valid = valid and isinstance(kinds, list) and set(kinds) <= set(KINDS)
         valid = valid and 1 <= len(kinds) <= 1000 and isinstance(meta.get("about", {}), dict)
     except (KeyError, TypeError, ValueError, RecursionError):
         valid = False
     if not valid:
-        raise InputError(source, "meta", "is not that of a policy; `wholearm policy` writes them")
-    try:
-        limits = [require_number(limit, "limit", positive=True) for limit in settings.pop("limit")]
-        for key, value in settings.items():
-            positive = key == "period"
-            settings[key] = require_number(value, key, positive=positive, nonnegative=not positive)
-        one, two = limits
-        settings["limit"] = one, two
-    except (TypeError, ValueError):
-        raise InputError(source, "meta.pace.limit", "is not two numbers") from None
-    except InputError as error:
-        raise InputError(source, f"meta.pace.{error.key}", error.problem) from None
-    return meta
+        raise InputError("", "meta", "is not that of a policy; `wholearm policy` writes them")
+    with name_source(prefix="meta.pace."):
+        one, two = require_vector(pace.pop("limit"), "limit", 2).tolist()
+        pace = {key: require_number(value, key, nonnegative=True) for key, value in pace.items()}
+        for key, value in (("limit", min(one, two)), ("period", pace["period"])):
+            require_number(value, key, positive=True)
+    return meta | {"pace": LoopSettings(**pace, limit=(one, two))}
 
 
 def _read_tables(
-    source: str, arrays: Mapping[str, Any], number: int, shapes: Mapping[str, tuple[int, ...]]
+    arrays: Mapping[str, Any], number: int, shapes: Mapping[str, tuple[int | str, ...]]
 ) -> dict[str, Any]:
     """Checked tables of a law."""
-    tables = {}
+    tables, count = dict[str, Any](), len(np.atleast_1d(arrays.get(f"theta_{number}", 0.0)))
+    sizes: dict[int | str, int] = {"n": count, "n - 1": count - 1}
     for name, shape in shapes.items():
-        key, none = f"{name}_{number}", np.zeros([max(n, 0) for n in shape])
-        array = arrays.get(key, none if name in LATER else None)
+        key, none = f"{name}_{number}", np.zeros([0 if isinstance(n, str) else n for n in shape])
+        array = tables[name] = arrays.get(key, none if name in LATER else None)
         if array is None:
-            raise InputError(source, key, "array is missing")
+            raise InputError("", key, "array is missing")
+        if name in LATER and not array.size:
+            continue
+        needed = [sizes.get(n, n) for n in shape]
         fits = array.dtype.kind == "f" and array.ndim == len(shape) and np.isfinite(array).all()
-        if not fits or any(w not in (-1, n) for w, n in zip(shape, array.shape, strict=True)):
-            needed = ", ".join("any" if n < 0 else str(n) for n in shape)
-            text = f"{array.dtype} of shape {array.shape} given, numbers of shape ({needed}) needed"
-            raise InputError(source, key, text)
-        tables[name] = array
-    curve = "s" in tables
-    axis, spans = ("s", ["levels", "torque"]) if curve else ("starts", [])
-    spans += ["forces"] if curve and len(tables["forces"]) else []
-    nodes = ("theta", "b", "s") if curve else ("theta", "rates", "tau", "gain")
-    count = len(tables["theta"])
-    lengths = {len(tables[name]) for name in nodes} | {len(tables[name]) + 1 for name in spans}
-    if count < 2 or lengths != {count}:
-        raise InputError(source, f"theta_{number}", "has not as many places as other arrays")
+        if not fits or any(w not in (n, "any") for w, n in zip(needed, array.shape, strict=True)):
+            text = f"{array.dtype} of shape {array.shape} given, numbers of shape "
+            raise InputError("", key, f"{text}({', '.join(map(str, needed))}) needed")
+    if count < 2:
+        raise InputError("", f"theta_{number}", "has less than two places")
+    axis = "s" if "s" in tables else "starts"
     if not (np.diff(tables[axis]) > 0).all() or not len(tables[axis]):
-        raise InputError(source, f"{axis}_{number}", "does not increase")
-    if not curve and tables["step"][0] <= 0:
-        raise InputError(source, f"step_{number}", "is not positive")
+        raise InputError("", f"{axis}_{number}", "does not increase")
+    if "step" in tables and tables["step"][0] <= 0:
+        raise InputError("", f"step_{number}", "is not positive")
     return tables
 
 
