@@ -35,8 +35,6 @@ from ..results.dwell_record import TorqueChange, change_torques
 from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.simulate import simulate
-from .dwell import Junction, add_pause, choose_junction, settle_plans
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
@@ -98,6 +96,8 @@ class Planning:
         """The plans with dwells at their ends, where the problem asks for these."""
         if all(self.problem.settles(phase) == 0 for phase in self.problem.phases):
             return self.plans
+        from .dwell import settle_plans
+
         return settle_plans(self.problem, self.plans)
 
     @cached_property
@@ -199,6 +199,8 @@ def _replay(planning: Planning) -> Array:
     Motions with several freedoms are unstable in open loop. Case: query 9 with periods of 2 ms,
     where 2e-6 rad grow 900 times in phase 20.
     """
+    from ..simulation.simulate import simulate
+
     phases = planning.problem.phases[: len(planning.plans)]
     torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
     replay = simulate(replace(planning.problem, phases=phases), torque)
@@ -277,6 +279,8 @@ def plan_with_pauses(
     duration: float | None,
 ) -> Plans:
     """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
+    from .dwell import add_pause
+
     before, scene = planning.plans[-1:], planning.problem.scene
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
@@ -498,6 +502,8 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
 
     Torques change in pauses from those of the block before, and to those of the next one.
     """
+    from .dwell import Junction, add_pause, choose_junction
+
     epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
     # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
     more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]

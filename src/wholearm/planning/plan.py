@@ -35,7 +35,6 @@ from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import plan_curves
 from .phase_plan import PlanPart, Plans, combine, plan_stops
-from .replay_check import replay_plan
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
@@ -126,6 +125,8 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         unique = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
         planned, figures = time.perf_counter(), None
         if options.replay:
+            from .replay_check import replay_plan
+
             first = planning
             planning, figures = replay_plan(planning, report)
             if planning is not first:

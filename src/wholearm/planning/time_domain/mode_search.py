@@ -168,7 +168,9 @@ def _list_possible(stage: Stage, search: TimeSearch, node: int) -> list[tuple[fl
     listed = Statics(own, z).list_continuous(epsilon, held) or ()
     # A joint that does not turn at first may turn either way later: phase 15 of query 28.
     turns = mode_of(stage)[-2:]
-    return [(x, (*m[:-2], *(a or b for a, b in zip(m[-2:], turns, strict=True)))) for x, m in listed]
+    return [
+        (x, (*m[:-2], *(a or b for a, b in zip(m[-2:], turns, strict=True)))) for x, m in listed
+    ]
 
 
 def change_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[Stage]]:

@@ -52,13 +52,13 @@ from .mode_search import (
     LEAST_INTERVALS,
     WORTH,
     adapt_ends,
+    change_ends,
     drop_gone,
     drop_stops,
     improve,
     link,
     list_as_good,
     list_neighbours,
-    change_ends,
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
