@@ -52,13 +52,13 @@ from .mode_search import (
     LEAST_INTERVALS,
     WORTH,
     adapt_ends,
-    change_ends,
     drop_gone,
     drop_stops,
     improve,
     link,
     list_as_good,
     list_neighbours,
+    roll_at_ends,
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
@@ -219,7 +219,7 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
 
     # Case of contacts that roll at an end: phase 8 of query 24, in whose plan with free torques one
     # hardly slides.
-    for candidate in chain([own], islice(change_ends(own, search), ROLLING)):
+    for candidate in chain([own], islice(roll_at_ends(own, search), ROLLING)):
         stages = [stage.stretch(1.3) for stage in candidate]
         if (
             reaches(1.0, 80 if candidate is own else ITERATIONS)
