@@ -174,25 +174,29 @@ def _list_possible(stage: Stage, search: TimeSearch, node: int) -> list[tuple[fl
     return possible
 
 
-def roll_at_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[Stage]]:
-    """Stages with a contact that rolls in the first or last interval of a motion from rest to rest.
+def change_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[Stage]]:
+    """Stages with another mode in the first or last interval of a motion from rest to rest.
 
-    Those first in which it slides most slowly: with continuous torques it may not slide at all.
+    The modes are those that continuous torques allow there. First come those in which a contact
+    rolls, the one first that slides most slowly: with continuous torques it may not slide at all.
+    The others follow by the number of signs that differ, and by their margins.
     """
-    begins, rolling = True, list[tuple[float, list[Stage]]]()
+    begins, changed = True, list[tuple[int, float, list[Stage]]]()
     for k, stage in enumerate(stages):
         last, mode = stage.intervals - 1, mode_of(stage)
         for node, first in [(0, 0)] * begins + [(-1, last)] * stage.rests:
             part = stage.guess
             rates = np.abs(stage.measure_senses(part.z[first], part.v[first])).max(axis=0)
-            for _, signs in _list_possible(stage, search, node):
+            for margin, signs in _list_possible(stage, search, node):
                 rows = [row for row, pair in enumerate(zip(signs, mode, strict=True)) if ne(*pair)]
-                if rows and not any(signs[row] for row in rows):
-                    pieces = split(stage, search.scheme, first, first + 1, signs)
-                    changed = link(merge([*stages[:k], *pieces, *stages[k + 1 :]]))
-                    rolling.append((float(rates[rows].max() / rates.max()), changed))
+                if not rows:
+                    continue
+                rolls = not any(signs[row] for row in rows)
+                rank = (0, rates[rows].max() / rates.max()) if rolls else (len(rows), -margin)
+                pieces = split(stage, search.scheme, first, first + 1, signs)
+                changed.append((*rank, link(merge([*stages[:k], *pieces, *stages[k + 1 :]]))))
         begins = stage.rests
-    yield from (changed for _, changed in sorted(rolling, key=itemgetter(0)))
+    yield from (others for *_, others in sorted(changed, key=itemgetter(0, 1)))
 
 
 def divide(

@@ -52,13 +52,13 @@ from .mode_search import (
     LEAST_INTERVALS,
     WORTH,
     adapt_ends,
+    change_ends,
     drop_gone,
     drop_stops,
     improve,
     link,
     list_as_good,
     list_neighbours,
-    roll_at_ends,
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
@@ -68,7 +68,7 @@ from .time_motion import TimeMotion, make_phase_motions
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
 # a pentagon, 0.369 s from the modes of a plan of 0.094 s (the test of given modes)
 SLOWER = 1.2
-ROLLING = 2  # most ends at which a contact rolls that are tried
+OTHER_ENDS = 2  # most other modes at an end that are tried
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 
 
@@ -201,14 +201,14 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
     stages = own = adapt_ends(free, search)
 
-    def reaches(factor: float, most: int = 80) -> bool:
+    def reaches(factor: float) -> bool:
         """Whether there is a solution with motors so many times as quick, from the last one."""
         nonlocal stages
         tried.append(factor)
         scene = search.source.scene.quicken(factor)
         quick = replace(search, source=replace(search.source, scene=scene))
         moved = link([stage.move_to(quick.problem.scene) for stage in stages])
-        solution = quick.solve(moved, most=most)
+        solution = quick.solve(moved, most=80)
         if solution.success:
             plans.append((factor, quick, solution))
             stages = solution.stages
@@ -217,14 +217,11 @@ def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
     def refine_last() -> TimeSolution:
         return plans[-1][2] if search.only_begins else refine_stages(search, plans[-1][2])
 
-    # Case of contacts that roll at an end: phase 8 of query 24, in whose plan with free torques one
-    # hardly slides.
-    for candidate in chain([own], islice(roll_at_ends(own, search), ROLLING)):
+    # Cases of other modes at an end: phase 8 of query 24, where a contact rolls that hardly slides
+    # with free torques, and phases 2 and 3 of query 0, where one slides back.
+    for candidate in chain([own], islice(change_ends(own, search), OTHER_ENDS)):
         stages = [stage.stretch(1.3) for stage in candidate]
-        if (
-            reaches(1.0, 80 if candidate is own else ITERATIONS)
-            and (solution := refine_last()).success
-        ):
+        if reaches(1.0) and (solution := refine_last()).success:
             return solution
     stages, step = [stage.stretch(1.3) for stage in own], 4.0
     if plans:
