@@ -329,7 +329,7 @@ def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
 
 
 def build_parser(given: Sequence[str] | None = None) -> Parser:
-    """The parser of all commands; of the studies, those alone that a command line asks for."""
+    """The parser of all commands; options are those of the one alone that is given, if any."""
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     version = f"wholearm {wholearm.__version__}"
     parser.add_argument("--version", action="version", version=version, help="print the version")
@@ -337,7 +337,8 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
     for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
         head, _, table = part.partition("\n")
         name, text = head.removeprefix("[[").split("]]  ")
-        subparser = add_parser(commands, name, text, table)
+        asked = given is None or name in given[:1]
+        subparser = add_parser(commands, name, text, table if asked else "")
         subparser.set_defaults(run=globals()[f"_{name}"])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)

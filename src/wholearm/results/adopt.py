@@ -115,7 +115,7 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
     the hand is another one, a base or a length being off by more than a tenth of the link.
     """
     own = meta.get("problem")
-    if not isinstance(own, Mapping):
+    if not isinstance(own, Mapping) or own == problem.table:
         return ""
     with suppress(InputError):
         # Files of earlier versions have the tables as they were written by hand.
