@@ -43,7 +43,7 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import ONE, A, B, build_force_rows, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
-from ..planning.lower_bound import PathTerms, bound_least_time
+from ..planning.lower_bound import GIVE, PathTerms, bound_least_time
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
@@ -55,6 +55,7 @@ from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
+from .refusals import slides
 from .study import Case, Findings, Row, Study, group
 
 if TYPE_CHECKING:
@@ -257,10 +258,7 @@ def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any
     row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
     def rate(_: float, y: Array) -> float:
-        if row >= len(before.Xi):
-            return float(y[8 + row - len(before.Xi)])
-        touch = locate(formation.scene, formation.contacts[row].name, y[None, :5])
-        return float(touch.tangent[0] @ y[5:])
+        return float(slides(formation, y[None, :5], y[None, 5:])[0, row])
 
     rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
     return rate
@@ -425,11 +423,13 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     path = PathTerms((instance.curve,), instance.problem.epsilon)
     angles, owner = path.make_grid(int(setting))
     s = path.place(angles)
-    rows = path.evaluate(np.column_stack([angles[:-1], angles[1:]]), owner).rows
+    # A bound relaxes limits, a plan does not.
+    rows = path.evaluate(np.column_stack([angles[:-1], angles[1:]]), owner).relax(-GIVE).rows
     rows = rows[:, :, rows[..., A].any(axis=(0, 1))]
-    # Of the second end by the squared speed at the first one: b + 2 ds a. One node has no interval.
+    # At the second end the squared speed is b + 2 ds a. The last node begins no interval.
+    last = rows[-1:, [1, 1]]
     rows[:, 1, :, A] += 2 * np.diff(s)[:, None] * rows[:, 1, :, B]
-    rows = np.concatenate([rows, rows[-1:, [1, 1]]]).reshape(len(s), -1, rows.shape[-1])
+    rows = np.concatenate([rows, last]).reshape(len(s), -1, rows.shape[-1])
     below, zero = -np.eye(rows.shape[1]), np.zeros(rows.shape[1])
     parameters = *(rows[..., column] for column in (A, B, ONE)), below, zero, None, None
     limits = LinearConstraint()

@@ -30,6 +30,7 @@ from ..planning.options import PlanOptions
 from ..planning.plan import plan_anew, solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
+from ..scene.model import Polygon
 from ..search.find_route import Answer, find_route, forget_roadmaps
 from ..verification.free import find_policy
 from ..verification.verify import verify
@@ -218,8 +219,8 @@ def _draw_goal(rng: np.random.Generator, table: dict[str, Any]) -> Problem:
 
 
 def _draw_pose(rng: np.random.Generator, table: dict[str, Any]) -> dict[str, float]:
-    count = len(table["object"]["vertices"])
-    size = build_problem(table).scene.scales.length
+    polygon = Polygon(*map(table["object"].get, ("vertices", "mass", "inertia")))
+    count, size = polygon.n_vertices, polygon.gyration_radius
     while True:
         edge, x = int(rng.integers(count)), round(size * rng.uniform(-3.0, 3.0), 4)
         try:
