@@ -214,7 +214,7 @@ Bounds = list[tuple[float | None, float | None]]
 
 def slow_margin(formation: Formation, epsilon: float, z: Array, z_s: Array) -> float:
     """Least margin of all places, each at its best, for vanishing speed."""
-    curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
+    curve = np.arange(1.0 * len(z)), z, z_s
     margin = _solve_along(formation, epsilon, curve, np.zeros(len(z)))
     return float(np.nan_to_num(margin, nan=-np.inf))
 
@@ -230,25 +230,24 @@ def fast_margin(
     The curve (s, z, z_s) is as of `resample`; `rests` says whether the motion is at rest at its
     start and at its end.
     """
-    s, z, z_s = curve
+    z_s = curve[2]
     with np.errstate(divide="ignore"):
         joints = ((formation.scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
     top = np.minimum(1e6, joints / formation.scene.scales.speed**2)
     top[[0, -1]] *= ~np.array(rests)
-    z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
-    return _solve_along(formation, epsilon, (s, z, z_s, z_ss), top)
+    return _solve_along(formation, epsilon, curve, top)
 
 
 def _solve_along(
-    formation: Formation, epsilon: float, curve: tuple[Array, Array, Array, Array], top: Array
+    formation: Formation, epsilon: float, curve: tuple[Array, Array, Array], top: Array
 ) -> float:
-    """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
+    """Largest margin along a curve (s, z, z_s), b being at most `top` at its n places.
 
     Unknowns: b and v, which stands for sqrt(b), at the places, contact forces c_n and c_t(rolling)
     at both ends of every interval, and the margin. Forces are over the scene's weight, torques over
     their limits, and lengths over the radius of gyration.
     """
-    s, z, z_s, z_ss = curve
+    (s, z, z_s), z_ss = curve, np.gradient(curve[2], curve[0], axis=0)
     scene, n_c, rolling = formation.scene, formation.n_contacts, list(formation.rolling_rows)
     length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
     n, mass, signs = len(s), scene.mass_diagonal * speed**2, _signs(formation, z, z_s)
@@ -275,16 +274,15 @@ def _solve_along(
         kept += [press, most - grip, most + grip, 1 - law[3:, :], 1 + law[3:, :]]
     # v is below the tangents of sqrt(b), and above its chord.
     moving = np.flatnonzero(top)
-    root, between = np.sqrt(top[moving]), v[moving]
-    chord = b[moving] / root[None]
-    bent = [between - chord]
-    bent += [(x * root[None] + chord / x) / 2 - between for x in np.geomspace(1e-3, 1.0, 13)]
+    root, between = np.sqrt(top[moving])[None], v[moving]
+    chord = b[moving] / root
+    bent = [(x * root + chord / x) / 2 - between for x in np.geomspace(1e-3, 1.0, 13)]
+    bent.append(between - chord)
     upper = ca.vertcat(_stack(kept) - margin, _stack(bent))
     (A_ub, b_ub), (A_eq, b_eq) = (_split(rows, unknowns) for rows in (upper, _stack(equal)))
-    bounds: Bounds = [*zip(np.zeros(n), top, strict=True)]
-    bounds += [(0.0, None if limit else 0.0) for limit in top]
-    bounds += [(None, None)] * (2 * count) + [(None, 1.0)]
-    return maximise(-A_ub, b_ub, A_eq, -b_eq, bounds)
+    least = np.repeat([0.0, -np.inf], [2 * n, 2 * count + 1])
+    most = [*top, *np.where(top > 0, np.inf, 0.0), *np.full(2 * count, np.inf), 1.0]
+    return maximise(-A_ub, b_ub, A_eq, -b_eq, [*zip(least, most, strict=True)])
 
 
 def _stack(parts: Sequence[Expression]) -> Expression:
