@@ -273,7 +273,7 @@ def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(pa
 def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
     pair = pairs["a figure"]
     rows = [
-        {"case": ["anywhere", "a figure", having, 0], **plan()}
+        {"part": "a figure", "having": having, **plan()}
         for having, plan in zip((False, True), pair, strict=True)
     ]
     *_, table = SKIP.report(rows, argparse.Namespace())[0]

@@ -45,7 +45,7 @@ from ..simulation.system import NODES
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
 from .stress import BASE, OBJECTIVES, STRANGE, change_tree, damage_torques
-from .study import Case, Findings, Row, Study, digest_source, name_case
+from .study import Case, Findings, Row, Study, digest_source, group, name_case
 
 FOUR = "heptagon_four_contacts"
 PROBLEMS = (
@@ -555,6 +555,7 @@ class Corpus(Study):
     """Answers of today against stored ones."""
 
     name, title = "corpus", "Answers against stored ones"
+    keys = ("family",)
     folder, shipped = "build", True
     problems, rounding = Path("problems"), 0
     options = """\
@@ -577,7 +578,7 @@ class Corpus(Study):
         """Those that are asked for."""
         self.problems, self.rounding = Path(options.problems), options.rounding
         for case in list_cases():
-            if any(fnmatch(" ".join(map(str, case)), pattern) for pattern in options.only or "*"):
+            if any(fnmatch(name_case(case), pattern) for pattern in options.only or "*"):
                 yield case
 
     def limit(self, case: Case) -> float:
@@ -595,32 +596,27 @@ class Corpus(Study):
         new = options.update and not Path(options.answers).exists()
         stored = {} if new else read_json(options.answers)
         if options.update:
-            stored |= {name_case(row): row["answer"] for row in rows}
-            names = sorted({" ".join(map(str, case)) for case in list_cases()} & stored.keys())
+            stored |= {row["name"]: row["answer"] for row in rows}
+            names = sorted({*map(name_case, list_cases())} & stored.keys())
             lines = [f"{json.dumps(name)}: {json.dumps(stored[name])}" for name in names]
             write_text(options.answers, "{\n" + ",\n".join(lines) + "\n}\n")
-        verdicts = {}
-        for row in rows:
-            pair = row["answer"], stored.get(name_case(row))
-            one, other = map(_reduce, pair) if options.values else pair
-            verdicts[name_case(row)] = compare(row["case"][0], one, other)
         kinds = ("same", "better", "other words", "differs")
-        table = []
-        for family in [*dict.fromkeys(row["case"][0] for row in rows), "all"]:
-            mine = [row for row in rows if family in ("all", row["case"][0])]
-            count = Counter(verdicts[name_case(row)][0] for row in mine)
+        table, others, wrong = list[list[Any]](), list[str](), list[str]()
+        for family, mine in group(rows, "family").items():
+            count = Counter[str]()
+            for row in mine:
+                pair = row["answer"], stored.get(row["name"])
+                kind, texts = compare(family, *(map(_reduce, pair) if options.values else pair))
+                count[kind] += 1
+                if kind == "differs":
+                    wrong += [f"{row['name']}: {text}" for text in texts[:3]]
+                elif texts:
+                    others.append(f"* {kind}: {row['name']}: {texts[0]}")
             seconds = sum(row["seconds"] for row in mine)
-            table.append((family, len(mine), *(count[kind] for kind in kinds), seconds))
+            table.append([family, len(mine), *(count[kind] for kind in kinds), seconds])
+        table.append(["all", *map(sum, zip(*(line[1:] for line in table), strict=True))])
         heads = ["family", *(f"{name}:d" for name in ("cases", *kinds)), "processor time [s]:.0f"]
-        others = [
-            f"* {kind}: {name}: {texts[0]}"
-            for name, (kind, texts) in verdicts.items()
-            if kind in kinds[1:3]
-        ]
-        wrong = {name: texts for name, (kind, texts) in verdicts.items() if kind == "differs"}
-        return [Table(heads, table), "\n".join(others)], [
-            f"{name}: {text}" for name, texts in wrong.items() for text in texts[:3]
-        ]
+        return [Table(heads, table), "\n".join(others)], wrong
 
 
 STUDY = Corpus()
@@ -675,10 +671,10 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
             for weak, text in _differ(family, subkey, found.get(name), stored.get(name)):
                 yield weak, f"{name}: {text}"
         return
-    numbers, others = _flatten(found), _flatten(stored)
-    if numbers is not None and others is not None and len(numbers) == len(others):
-        off = max(abs(a - b) for a, b in zip(numbers, others, strict=True))
-        scale = max(map(abs, [*numbers, *others]))
+    leaves, others = _list_leaves(found), _list_leaves(stored)
+    if len(leaves) == len(others) and {*map(type, leaves + others)} <= {int, float}:
+        off = max(abs(a - b) for a, b in zip(leaves, others, strict=True))
+        scale = max(map(abs, leaves + others))
         # One sample at the edge of what a plan bears may end otherwise.
         if off > (1 if key in COUNTED else _allowed(family, key) * scale):
             yield key in WORDS, f"{_show(found)}, stored {_show(stored)}, off by {off:.2g}"
@@ -689,13 +685,9 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
         yield key in WORDS, f"{_show(found)}, stored {_show(stored)}"
 
 
-def _flatten(value: Any) -> list[float] | None:
-    """A number, or numbers in lists, as a list; None for anything else."""
-    if isinstance(value, list) and value:
-        parts = [_flatten(entry) for entry in value]
-        return None if None in parts else [*chain(*filter(None, parts))]
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return [value] if is_number else None
+def _list_leaves(value: Any) -> list[Any]:
+    """What nested lists hold, among it empty ones, or the value itself."""
+    return [*chain(*map(_list_leaves, value))] if value and isinstance(value, list) else [value]
 
 
 def _show(value: Any) -> str:

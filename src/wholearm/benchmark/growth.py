@@ -22,7 +22,7 @@ from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
 from .scenes import name_first
-from .study import Case, Findings, Row, Study
+from .study import Case, Findings, Row, Study, group
 
 WORK = {
     "intervals": (("least time", "margin"), (50, 100, 200, 400, 800, 1600, 3200)),
@@ -39,7 +39,8 @@ class Growth(Study):
 
     name, title, timed = "growth", "How cost and memory grow", True
     alone = True
-    columns = ("grows", "work", "size", "seconds", "memory")
+    keys = ("problem", "grows", "work", "size")
+    columns = (*keys[1:], "seconds", "memory")
     options = "problem  problem file (TOML) whose first phase is made larger\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
@@ -52,7 +53,7 @@ class Growth(Study):
         """Do one piece of work."""
         path, grows, work, size = case
         run_work(dict(read_problem(path).table), grows, work, size)
-        return {"grows": grows, "work": work, "size": size}
+        return {}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Tables with the exponents."""
@@ -96,7 +97,7 @@ STUDY = Growth()
 
 def select(rows: Sequence[Row], grows: str, work: str, field: str) -> tuple[list[int], list[float]]:
     """Sizes, and what some work has cost at them; what is nothing counts as little."""
-    mine = [row for row in rows if (row["grows"], row["work"]) == (grows, work)]
+    mine = group(rows, "grows", "work").get((grows, work), [])
     return [row["size"] for row in mine], [max(row[field], 1e-3) for row in mine]
 
 

@@ -43,7 +43,7 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import ONE, A, B, build_force_rows, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
-from ..planning.lower_bound import bound_least_time
+from ..planning.lower_bound import GIVE, PathTerms, bound_least_time
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
@@ -55,7 +55,8 @@ from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
 from ..simulation.simulate import simulate
 from ..verification.newton_euler import locate
-from .study import Case, Findings, Row, Study
+from .refusals import slides
+from .study import Case, Findings, Row, Study, group
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,10 +258,7 @@ def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any
     row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
     def rate(_: float, y: Array) -> float:
-        if row >= len(before.Xi):
-            return float(y[8 + row - len(before.Xi)])
-        touch = locate(formation.scene, formation.contacts[row].name, y[None, :5])
-        return float(touch.tangent[0] @ y[5:])
+        return float(slides(formation, y[None, :5], y[None, 5:])[0, row])
 
     rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
     return rate
@@ -416,77 +414,58 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
     return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
 
 
-def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
-    """Limits at places of a curve, whose segments are `owner`."""
-    curve, point = instance.curve, instance.curve.evaluate(s)
-    forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
-    limits = make_limits(curve.formation, instance.problem.epsilon)
-    return PathLimits.of(limits, forces, point.z_s[:, 3:])
-
-
 def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
     import toppra
     from toppra.constraint import DiscretizationType, LinearConstraint
-    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     toppra.setup_logging("ERROR")
-    length = instance.curve.length
-    apart = 1e-7 * length  # of grid points from a reversal between them
-    grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
-    for part in instance.curve.segments[:-1]:
-        near = np.abs(grid - part.stop) > 4 * apart
-        grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
-        grid.sort()
-    stops = [part.stop for part in instance.curve.segments[:-1]]
-    rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
-    constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
-    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
-
-    # The parameters of the limits, with the internal force eliminated, are those of the grid.
-    limits, columns = LinearConstraint(), (a, b, constant, below, zero, None, None, grid)
+    path = PathTerms((instance.curve,), instance.problem.epsilon)
+    angles, owner = path.make_grid(int(setting))
+    s = path.place(angles)
+    # A bound relaxes limits, a plan does not.
+    rows = path.evaluate(np.column_stack([angles[:-1], angles[1:]]), owner).relax(-GIVE).rows
+    rows = rows[:, :, rows[..., A].any(axis=(0, 1))]
+    # At the second end the squared speed is b + 2 ds a. The last node begins no interval.
+    last = rows[-1:, [1, 1]]
+    rows[:, 1, :, A] += 2 * np.diff(s)[:, None] * rows[:, 1, :, B]
+    rows = np.concatenate([rows, last]).reshape(len(s), -1, rows.shape[-1])
+    below, zero = -np.eye(rows.shape[1]), np.zeros(rows.shape[1])
+    parameters = *(rows[..., column] for column in (A, B, ONE)), below, zero, None, None
+    limits = LinearConstraint()
     limits.identical = True
     limits.set_discretization_type(DiscretizationType.Interpolation)
-    parameters = canlinear_colloc_to_interpolate(*columns, identical=True)
     limits.compute_constraint_params = lambda *_: parameters
-    path = toppra.SplineInterpolator(grid, grid[:, None])
+    places = toppra.SplineInterpolator(s, s[:, None])
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
-    planner = toppra.algorithm.TOPPRA([limits], path, gridpoints=grid, **options)
+    planner = toppra.algorithm.TOPPRA([limits], places, gridpoints=s, **options)
 
     def run() -> Plan:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
         if speeds is None or not np.isfinite(speeds).all():
             return "no feasible parametrisation"
-        return _make_plan(instance, grid, np.asarray(speeds))
+        return _make_plan(instance, s, owner, np.asarray(speeds) ** 2)
 
     return run
 
 
-def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
-    """Torques by inverse dynamics, with the internal force linear between grid points.
+def _make_plan(instance: Instance, s: Array, owner: Numbers, b: Array) -> TorqueProfile:
+    """Torques by inverse dynamics, with the internal force linear between the nodes `s`.
 
-    The two points beside a reversal become one, with a step of the torques.
+    `b` is the squared speed there, and `owner` the segments of the intervals.
     """
-    stops = np.array([part.stop for part in instance.curve.segments[:-1]])
-    for stop in stops:
-        k = int(np.searchsorted(grid, stop)) - 1
-        speed = (speeds[k] + speeds[k + 1]) / 2
-        grid, speeds = (
-            np.concatenate([part[:k], [middle], part[k + 2 :]])
-            for part, middle in ((grid, stop), (speeds, speed))
-        )
-    steps, b = np.diff(grid), speeds**2
-    a, owner = np.diff(b) / (2 * steps), np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
-    ends = [
-        np.mean(_limit(instance, grid[p], owner).find_internal_force_range(a, b[p]), axis=0)
-        for p in (slice(-1), slice(1, None))
-    ]
-    elements = lay_out(np.column_stack([grid[:-1], grid[1:]]), owner, (True, True))
-    each = np.repeat(np.arange(len(steps)), NODES)
-    part = (elements.s - grid[each]) / steps[each]
-    internal = ends[0][each] * (1 - part) + ends[1][each] * part
-    profile = Profile(a[each], np.interp(elements.s, grid, b), internal)
-    motion = PathMotion(instance.curve, elements, profile)
+    curve, edges, steps = instance.curve, np.column_stack([s[:-1], s[1:]]), np.diff(s)
+    point, a = curve.evaluate(edges.ravel()), np.diff(b) / (2 * steps)
+    forces = inverse(curve.formation, *point[:3], directions_of(curve, np.repeat(owner, 2)))
+    limits = make_limits(curve.formation, instance.problem.epsilon)
+    ends = np.repeat(a, 2), np.column_stack([b[:-1], b[1:]]).ravel()
+    span = PathLimits.of(limits, forces, point.z_s[:, 3:]).find_internal_force_range(*ends)
+    internal = np.mean(span, axis=0).reshape(-1, 2)
+    elements = lay_out(edges, owner, (True, True))
+    share = (elements.s.reshape(-1, NODES) - edges[:, :1]) / steps[:, None]
+    within = (internal[:, :1] + share * np.diff(internal)).ravel()
+    profile = Profile(np.repeat(a, NODES), np.interp(elements.s, s, b), within)
+    motion = PathMotion(curve, elements, profile)
     breaks = np.append(motion.times[::NODES], motion.duration)
     return TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, 4)
 
@@ -644,15 +623,6 @@ TARGETS = dict.fromkeys(SIMULATION, (1e-6, 1e-9, 1e-11)) | dict.fromkeys(
 """Errors at which run times are compared, by study."""
 
 
-def _group(rows: Sequence[Row], study: str) -> dict[str, list[Row]]:
-    """Rows of a study by method, in the order of methods, as cases are listed."""
-    groups = dict[str, list[Row]]()
-    for row in rows:
-        if row["study"] == study:
-            groups.setdefault(row["method"], []).append(row)
-    return groups
-
-
 def _find_times(rows: Sequence[Row], target: float, count: int | None) -> dict[str, float]:
     """Least times in which a method reaches an error on each phase [s]; infinite without any.
 
@@ -671,14 +641,14 @@ def _format_targets(
     rows: Sequence[Row], study: str, title: str, count: int | None, limit: float
 ) -> list[str | Table]:
     """Times to reach errors, and how many times as long as ours that is."""
-    groups, table = _group(rows, study), []
+    groups, table = group(rows, "method"), []
     own = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
     if own is None:
         return []
-    for method, group in groups.items():
+    for method, mine in groups.items():
         cells: list[Any] = [method]
         for target in TARGETS[study]:
-            times, ours = (_find_times(part, target, count) for part in (group, own))
+            times, ours = (_find_times(part, target, count) for part in (mine, own))
             names = times.keys() & ours.keys()
             reached = sum(math.isfinite(times[name]) for name in names)
             mean, least = (
@@ -696,17 +666,16 @@ def _format_targets(
 def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
     """One panel; hollow markers are settings with which some phases are not solved."""
     planning = study in PLANNING
-    for index, (method, mine) in enumerate(_group(rows, study).items()):
+    for index, (method, mine) in enumerate(group(rows, "method").items()):
         points, hollow = list[tuple[float, float]](), list[tuple[float, float]]()
-        for setting in dict.fromkeys(row["setting"] for row in mine):
-            group = [row for row in mine if row["setting"] == setting]
-            finite_rows = [row for row in group if np.isfinite(row["errors"][0])]
-            if 2 * len(finite_rows) < len(group):
+        for phases in group(mine, "setting").values():
+            finite_rows = [row for row in phases if np.isfinite(row["errors"][0])]
+            if 2 * len(finite_rows) < len(phases):
                 continue
             error = float(np.median([abs(row["errors"][0]) for row in finite_rows]))
             seconds = find_mean([row["solve"] + planning * row["build"] for row in finite_rows])
             points.append((max(error, 1e-16), seconds))
-            hollow += points[-1:] * any(row["outcome"] != SOLVED for row in group)
+            hollow += points[-1:] * any(row["outcome"] != SOLVED for row in phases)
         look: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
         axes.loglog(*np.reshape(points, (-1, 2)).T, label=method, **look)
         look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
@@ -724,7 +693,8 @@ class Precision(Study):
     """Every setting of every method on every phase of four sliding contacts."""
 
     name, title, timed = "precision", "Run time against error, with peers", True
-    columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
+    keys = ("study", "phase", "method", "setting")
+    columns = (*keys, "build", "solve", "errors", "outcome")
     shipped = True
     allowed = 60.0
     options = """\
@@ -759,26 +729,26 @@ class Precision(Study):
         study, name, method, setting, files = case
         instances = list_instances(files, study != NO_DRAG)
         instance = next(instance for instance in instances if instance.name == name)
-        measured = run_setting(instance, study, method, setting)
-        return dict(zip(self.columns[:4], case, strict=False)) | measured
+        return run_setting(instance, study, method, setting)
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """All tables."""
-        measured = [row for row in rows if "errors" in row]
+        measured = group((row for row in rows if "errors" in row), "study")
         parts: list[str | Table] = [INTRODUCTION]
         counts = {", by the error of the phase time": 1, ", by all three errors": None}
         for study in SIMULATION + PLANNING:
             for title, count in counts.items() if study in PLANNING else [("", None)]:
-                parts += _format_targets(measured, study, title, count, options.limit)
+                mine = measured.get(study, [])
+                parts += _format_targets(mine, study, title, count, options.limit)
         table = [(name, method.settings) for name, method in METHODS.items()]
         return [*parts, "## Settings", Table(["method", "settings"], table)], []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Mean run time over the error that half of the phases keep, one line for each method."""
-        measured = [row for row in rows if "errors" in row]
+        measured = group((row for row in rows if "errors" in row), "study")
         with open_figure(11.0, 9.0, layout="constrained") as figure:
             for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
-                _draw_study(axes, measured, study)
+                _draw_study(axes, measured.get(study, []), study)
         return figure
 
 

@@ -30,10 +30,11 @@ from ..planning.options import PlanOptions
 from ..planning.plan import plan_anew, solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
+from ..scene.model import Polygon
 from ..search.find_route import Answer, find_route, forget_roadmaps
 from ..verification.free import find_policy
 from ..verification.verify import verify
-from .study import Case, Findings, Row, Study
+from .study import Case, Findings, Row, Study, group
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
 SAME = 1e-4  # relative difference of values of plans that count as the same
@@ -92,15 +93,14 @@ class Queries(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """What came of them, and the times."""
-        kinds = dict.fromkeys(row["kind"] for row in rows)
-        table, lines = [], []
-        for name, times in (
-            ("all", [row["first"] for row in rows]),
-            *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
-            ("second query", [row["second"] for row in rows if "second" in row]),
-        ):
-            if times:
-                table.append((name, len(times), *np.percentile(times, [50, 95, 100])))
+        groups, lines = {"all": rows, **group(rows, "kind")}, list[str]()
+        times = {name: [row["first"] for row in mine] for name, mine in groups.items()}
+        times["second query"] = [row["second"] for row in rows if "second" in row]
+        table = [
+            (name, len(took), *np.percentile(took, [50, 95, 100]))
+            for name, took in times.items()
+            if took
+        ]
         heads = ["queries", "number:d", "processor time, median [s]:.2f", "95 %:.2f", "most:.2f"]
         ratios = [row["second"] / row["first"] for row in rows if "second" in row]
         gaps = [row["gap"] for row in rows if row.get("gap") is not None]
@@ -122,8 +122,7 @@ class Queries(Study):
         told = ["Refused:", "\n".join(refusals)] if refusals else []
         parts: list[str | Table] = [Table(heads, table), "\n".join(lines)]
         parts += [Table(heads_of_ways, carried), *told]
-        wrong = [row for row in rows if "findings" in row]
-        return parts, [f"{row['text']}: {row['findings'][0]}" for row in wrong]
+        return parts, [f"{row['text']}: {row['findings'][0]}" for row in rows if "findings" in row]
 
 
 STUDY = Queries()
@@ -220,8 +219,8 @@ def _draw_goal(rng: np.random.Generator, table: dict[str, Any]) -> Problem:
 
 
 def _draw_pose(rng: np.random.Generator, table: dict[str, Any]) -> dict[str, float]:
-    count = len(table["object"]["vertices"])
-    size = build_problem(table).scene.scales.length
+    polygon = Polygon(*map(table["object"].get, ("vertices", "mass", "inertia")))
+    count, size = polygon.n_vertices, polygon.gyration_radius
     while True:
         edge, x = int(rng.integers(count)), round(size * rng.uniform(-3.0, 3.0), 4)
         try:

@@ -24,18 +24,18 @@ the planner.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
-from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_array, kron
 
-from ..common.arrays import Array, Flags
+from ..common.arrays import Array, Expression, Flags
 from ..common.errors import InputError, WholearmError
 from ..contacts.formation import Formation
 from ..mechanics import UNIQUENESS
@@ -43,7 +43,7 @@ from ..mechanics.dynamics import metric_weights, null_vector
 from ..planning.plan import solve
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
-from ..verification.newton_euler import Touch, dot, link_axis, locate, norm, place_object
+from ..verification.newton_euler import link_axis, locate, norm, place_object
 
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
@@ -196,29 +196,17 @@ def clearances(scene: Scene, z: Array) -> dict[str, Array]:
 def separate(first: Array, second: Array) -> Array:
     """Signed distance of convex polygons or segments, shape (n, k, 2) and (n, m, 2), as (n,).
 
-    Positive: the distance. Negative: minus the depth of the overlap.
+    Positive: the distance. Negative: minus the depth of the overlap. It is the largest gap of their
+    projections: along the lines from corner to corner, or along the normals of edges.
     """
-    depth = np.maximum(_reach(first, second), _reach(second, first))
-    distance = np.minimum(_nearest(first, second), _nearest(second, first))
-    return np.where(depth > 0, distance, depth)
-
-
-def _reach(first: Array, second: Array) -> Array:
-    """Largest gap along the normals of the first body's edges, both ways for a segment."""
-    along = np.roll(first, -1, axis=1) - first
-    along = along / np.maximum(norm(along), 1e-300)[..., None]
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    other = np.einsum("nkd,nmd->nkm", outward, second).min(axis=2)
-    return np.asarray((other - dot(outward, first)).max(axis=1))
-
-
-def _nearest(points: Array, body: Array) -> Array:
-    """Least distance of the points of one body to the edges of another, shape (n,)."""
-    along = np.roll(body, -1, axis=1) - body
-    apart = points[:, :, None] - body[:, None]
-    square = np.maximum(dot(along, along), 1e-300)
-    share = np.clip(dot(apart, along[:, None]) / square[:, None], 0.0, 1.0)
-    return np.asarray(norm(apart - share[..., None] * along[:, None]).min(axis=(1, 2)))
+    lines = first[:, :, None] - second[:, None]
+    sides = [np.roll(body, -1, axis=1) - body for body in (first, second)]
+    normals = np.concatenate([sides[0], -sides[1]], axis=1)[..., ::-1] * np.array([-1.0, 1.0])
+    along = np.concatenate([lines.reshape(len(first), -1, 2), normals], axis=1)
+    size, (one, other) = norm(along), (along @ body.swapaxes(1, 2) for body in (first, second))
+    gap = one.min(axis=2) - other.max(axis=2)
+    # Where corners coincide there is no line.
+    return np.asarray(np.where(size > 0, gap / np.maximum(size, 1e-300), -np.inf).max(axis=1))
 
 
 Bounds = list[tuple[float | None, float | None]]
@@ -226,7 +214,7 @@ Bounds = list[tuple[float | None, float | None]]
 
 def slow_margin(formation: Formation, epsilon: float, z: Array, z_s: Array) -> float:
     """Least margin of all places, each at its best, for vanishing speed."""
-    curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
+    curve = np.arange(1.0 * len(z)), z, z_s
     margin = _solve_along(formation, epsilon, curve, np.zeros(len(z)))
     return float(np.nan_to_num(margin, nan=-np.inf))
 
@@ -242,57 +230,70 @@ def fast_margin(
     The curve (s, z, z_s) is as of `resample`; `rests` says whether the motion is at rest at its
     start and at its end.
     """
-    s, z, z_s = curve
+    z_s = curve[2]
     with np.errstate(divide="ignore"):
         joints = ((formation.scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
     top = np.minimum(1e6, joints / formation.scene.scales.speed**2)
     top[[0, -1]] *= ~np.array(rests)
-    z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
-    return _solve_along(formation, epsilon, (s, z, z_s, z_ss), top)
+    return _solve_along(formation, epsilon, curve, top)
 
 
 def _solve_along(
-    formation: Formation, epsilon: float, curve: tuple[Array, Array, Array, Array], top: Array
+    formation: Formation, epsilon: float, curve: tuple[Array, Array, Array], top: Array
 ) -> float:
-    """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
+    """Largest margin along a curve (s, z, z_s), b being at most `top` at its n places.
 
-    Unknowns: b and v, which stands for sqrt(b), at the places, contact forces at both ends of every
-    interval, and the margin.
+    Unknowns: b and v, which stands for sqrt(b), at the places, contact forces c_n and c_t(rolling)
+    at both ends of every interval, and the margin. Forces are over the scene's weight, torques over
+    their limits, and lengths over the radius of gyration.
     """
-    s, z, z_s, z_ss = curve
-    n, signs = len(s), _signs(formation, z, z_s)
-    slope = diags_array(formation.scene.scales.length / (2 * np.diff(s))) @ (
-        eye_array(n - 1, n, k=1) - eye_array(n - 1, n)
-    )
-    upper, most, equal, equal_to = list[Any](), list[Array](), list[Any](), list[Array]()
-    for side in (0, 1):
-        at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
-        points = z[at], z_s[at], z_ss[at]
-        laws, laws_to, rows, least = _limits(formation, epsilon, *points, signs)
-        for blocks, matrix in ((equal, laws), (upper, -rows)):
-            every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
-            a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
-            c: list[Any] = [None, None]
-            c[side] = block_diag([coo_array(block) for block in matrix[:, :, 3:]])
-            blocks.append([a @ slope + b @ place, v @ place, *c])
-        upper[-1].append(np.ones((least.size, 1)))
-        most.append(-least.ravel())
-        equal_to.append(laws_to.ravel())
+    (s, z, z_s), z_ss = curve, np.gradient(curve[2], curve[0], axis=0)
+    scene, n_c, rolling = formation.scene, formation.n_contacts, list(formation.rolling_rows)
+    length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
+    n, mass, signs = len(s), scene.mass_diagonal * speed**2, _signs(formation, z, z_s)
+    count = formation.n_constraints * (n - 1)
+    unknowns = ca.MX.sym("x", 2 * n + 2 * count + 1)
+    *parts, margin = ca.vertsplit(unknowns, np.cumsum([0, n, n, count, count, 1]).tolist())
+    b, v = (part.T for part in parts[:2])
+    a = (b[1:] - b[:-1]) @ ca.diag(length / (2 * np.diff(s)))
+    unit = 1 / np.append(force * np.array([1.0, 1.0, length]), scene.torque_limit)
+    dry = np.pad(scene.dry[3:] * signs[:, n_c:], ((0, 0), (3, 0)))
+    mu = ca.diag(formation.friction[rolling])
+    equal, kept = list[Expression](), list[Expression]()
+    for at, part in zip((slice(0, n - 1), slice(1, n)), parts[2:], strict=True):
+        c, push = ca.reshape(part, -1, n - 1), _push(formation, z[at], signs)
+        terms = [(mass * z_s[at] / length, a), (mass * z_ss[at], b[at])]
+        terms += [(scene.viscous * z_s[at] * speed, v[at])]
+        terms += [(-force * push[:, :, k], c[k, :]) for k in range(formation.n_constraints)]
+        # What is left of Newton's and Euler's laws: for the joints, torques.
+        law = ((dry - scene.applied_force) * unit).T
+        law = law + sum((rates * unit).T @ ca.diag(each) for rates, each in terms)
+        press = c[:n_c, :] - epsilon / force
+        grip, most = c[n_c:, :], mu @ press[rolling, :]
+        equal.append(law[:3, :])
+        kept += [press, most - grip, most + grip, 1 - law[3:, :], 1 + law[3:, :]]
+    # v is below the tangents of sqrt(b), and above its chord.
     moving = np.flatnonzero(top)
-    bounds: Bounds = [*zip(np.zeros(n), top, strict=True)]
-    bounds += [(0.0, None if limit else 0.0) for limit in top]
-    if len(moving):
-        # v is below the tangents of sqrt(b), and above its chord.
-        some, root = eye_array(n, format="csr")[moving], np.sqrt(top[moving])
-        for share in np.geomspace(1e-3, 1.0, 13):
-            upper.append([-diags_array(0.5 / (share * root)) @ some, some, None, None, None])
-            most.append(share * root / 2)
-        upper.append([diags_array(1 / root) @ some, -some, None, None, None])
-        most.append(np.zeros(len(moving)))
-    A_ub, A_eq = block_array(upper, format="csr"), block_array(equal, format="csr")
-    bounds += [(None, None)] * (A_ub.shape[1] - 2 * n - 1) + [(None, 1.0)]
-    A_eq.resize(A_eq.shape[0], A_ub.shape[1])
-    return maximise(A_ub, np.concatenate(most), A_eq, np.concatenate(equal_to), bounds)
+    root, between = np.sqrt(top[moving])[None], v[moving]
+    chord = b[moving] / root
+    bent = [(x * root + chord / x) / 2 - between for x in np.geomspace(1e-3, 1.0, 13)]
+    bent.append(between - chord)
+    upper = ca.vertcat(_stack(kept) - margin, _stack(bent))
+    (A_ub, b_ub), (A_eq, b_eq) = (_split(rows, unknowns) for rows in (upper, _stack(equal)))
+    least = np.repeat([0.0, -np.inf], [2 * n, 2 * count + 1])
+    most = [*top, *np.where(top > 0, np.inf, 0.0), *np.full(2 * count, np.inf), 1.0]
+    return maximise(-A_ub, b_ub, A_eq, -b_eq, [*zip(least, most, strict=True)])
+
+
+def _stack(parts: Sequence[Expression]) -> Expression:
+    """All entries of matrices in one column."""
+    return ca.vertcat(*map(ca.vec, parts))
+
+
+def _split(rows: Expression, unknowns: Expression) -> tuple[Any, Array]:
+    """Coefficients of rows that are linear in the unknowns, and what is left without these."""
+    A, rest = map(ca.evalf, ca.linear_coeff(rows, unknowns))
+    return A.sparse(), rest.full()[:, 0]
 
 
 def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
@@ -300,14 +301,14 @@ def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
 
     Forces are not unique at 0 and below.
     """
-    touches = [locate(formation.scene, name, z) for name in formation.names]
     signs, rows = _signs(formation, z, z_s), constrain(formation, z)[1]
-    light, rolling = rows / formation.scene.mass_diagonal, formation.rolling_rows
-    without, ratios = light @ rows.transpose(0, 2, 1), []
-    owners = np.array([*range(len(touches)), *rolling])  # contact of each row
+    light, ratios = rows / formation.scene.mass_diagonal, list[Array]()
+    without = light @ rows.transpose(0, 2, 1)
+    # The contact of each row.
+    owners = np.array([*range(formation.n_contacts), *formation.rolling_rows])
     for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        matrix = light @ _push(touches, rolling, side)
-        for taken in product([False, True], repeat=len(touches)):
+        matrix = light @ _push(formation, z, side)
+        for taken in product([False, True], repeat=formation.n_contacts):
             chosen = np.flatnonzero(np.array(taken)[owners])
             minor = np.ix_(np.arange(len(z)), chosen, chosen)
             ratios.append(np.linalg.det(matrix[minor]) / np.linalg.det(without[minor]))
@@ -320,50 +321,15 @@ def _signs(formation: Formation, z: Array, z_s: Array) -> Array:
     return np.asarray(np.sign(rates[1:] + rates[:-1]))
 
 
-def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array:
+def _push(formation: Formation, z: Array, signs: Array) -> Array:
     """What the forces c_n and c_t(rolling) push with, shape (n, 5, n_c + R)."""
+    rolling = formation.rolling_rows
+    touches = [locate(formation.scene, name, z) for name in formation.names]
     pushes = [
         touch.normal - (0.0 if k in rolling else touch.friction) * signs[:, [k]] * touch.tangent
         for k, touch in enumerate(touches)
     ]
     return np.stack([*pushes, *(touches[k].tangent for k in rolling)], axis=2)
-
-
-def _limits(
-    formation: Formation, epsilon: float, z: Array, z_s: Array, z_ss: Array, signs: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Limits at n places, as rows over x = (a, b, v, c) >= least.
-
-    With forces over the scene's weight, torques over their limits and lengths over the radius of
-    gyration. v stands for sqrt(b), c for c_n and c_t(rolling).
-
-    Returns
-    -------
-    equal, equal_to : (n, 3, k) and (n, 3)  Newton's and Euler's laws of the object
-    rows, least : (n, m, k) and (n, m)      limits, from each of which a margin of 1 takes 1
-    """
-    scene, scales = formation.scene, formation.scene.scales
-    length, force, speed = scales.length, scales.force, scales.speed
-    n, n_c, rolling = len(z), formation.n_contacts, formation.rolling_rows
-    touches = [locate(scene, name, z) for name in formation.names]
-    mu, held = np.array([touch.friction for touch in touches]), list(rolling)
-    push = -force * _push(touches, rolling, signs)
-    mass = scene.mass_diagonal * speed**2
-    inertia = [mass * z_s / length, mass * z_ss, scene.viscous * z_s * speed]
-    drive = np.concatenate([np.stack(inertia, axis=2), push], axis=2)
-    scale, limit = force * np.array([1.0, 1.0, length]), scene.torque_limit
-    unit = np.eye(drive.shape[2])
-    press, grip = unit[3 : 3 + n_c], unit[3 + n_c : 3 + n_c + len(held)]
-    cone = mu[held, None] * press[held]
-    fixed = np.concatenate([press, cone + grip, cone - grip])
-    torque = drive[:, 3:] / limit[:, None]
-    dry = scene.dry[3:] * signs[:, n_c:] / limit
-    rows = [np.broadcast_to(fixed, (n, *fixed.shape)), -torque, torque]
-    least = [np.tile(epsilon / force * np.concatenate([np.ones(n_c), *[mu[held]] * 2]), (n, 1))]
-    least += [dry - 1.0, -dry - 1.0]
-    equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (n, 3))
-    matrices = np.concatenate(rows, axis=1), np.concatenate(least, axis=1)
-    return drive[:, :3] / scale[:, None], equal_to, *matrices
 
 
 def maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:

@@ -25,7 +25,7 @@ from ..planning.plan import solve
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
-from .study import Case, Findings, Row, Study
+from .study import Case, Findings, Row, Study, group
 
 COLUMNS = {"unknowns": "", "rows": "", "building": " [ms]", "solving": " [ms]"}  # units of tables
 
@@ -35,6 +35,7 @@ class Skip(Study):
 
     name, title, timed = "skip", "What each part costs", True
     alone = shipped = True
+    keys = ("problems", "part", "having")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Each part, without and with it, several times."""
@@ -53,12 +54,12 @@ class Skip(Study):
             "NLP, times those of the processor, as medians of fresh processes; building is all but "
             "the solver."
         )
-        table = list[list[Any]]()
-        for part in dict.fromkeys(row["case"][1] for row in rows):
-            table.append([part])
-            for column, having in product(COLUMNS, (False, True)):
-                group = [row for row in rows if row["case"][1:3] == [part, having]]
-                table[-1].append(median(row[column] for row in group))
+        groups = group(rows, "part", "having")
+        columns = [*product(COLUMNS, (False, True))]
+        table = [
+            [part, *(median(row[name] for row in groups[part, having]) for name, having in columns)]
+            for part in group(rows, "part")
+        ]
         heads = [(f"{name} without{unit}:.0f", f"with{unit}:.0f") for name, unit in COLUMNS.items()]
         return [text, Table(["part", *chain(*heads)], table)], []
 

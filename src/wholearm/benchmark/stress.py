@@ -44,17 +44,16 @@ from ..verification.newton_euler import balance, locate
 from ..verification.verify import verify
 from .refusals import OVERLAP, clearances, judge
 from .scenes import DrawnScene, Random, draw_case, pick
-from .study import Case, Findings, Row, Study, name_case
+from .study import Case, Findings, Row, Study, group
 
 OBJECTIVES = ("time", "effort", "margin")
 SAME = 1e-6  # relative difference of two values that rounding may make
 ROUNDING = 1e-6  # what may be left of an equation, a gap or its rate, in the scene's units
 STILL = 1e-5  # speed over the scene's own below which friction may point either way
-TRIALS = {"noise": 8, "change": 20}
-"""Times that noise is added to the masses, and that masses, friction, drag and limits change."""
+_MASSES = ("mass", "inertia")
 _PARTS = ("palm", "finger1", "finger2", "viscous", "dry", "torque_limit")
-CHANGES = {"noise": (("mass", "inertia"), 1e-10), "change": (("mass", "inertia", *_PARTS), 0.1)}
-"""Numbers that each of them changes, and by how much at most, relative."""
+TRIALS = {"noise": (8, _MASSES, 1e-10), "change": (20, (*_MASSES, *_PARTS), 0.1)}
+"""How often a problem's numbers are changed, which, and by how much at most, relative."""
 
 Finding = tuple[str, str]  # the kind of something that must not happen, and a text
 KINDS = (
@@ -71,6 +70,7 @@ class Stress(Study):
 
     name, title = "stress", "Stress study"
     strict = seeded = True
+    keys = ("part",)
     options = """\
 --scenes N           generated scenes = 1000 in 0..10000000
 --files N            damaged files = 0 in 0..10000000
@@ -95,8 +95,8 @@ class Stress(Study):
         yield from product(["scene"], [seed], numbers, OBJECTIVES)
         if only is None:
             yield from product(["file"], [seed], range(options.files))
-            for number in range(max(TRIALS.values())):
-                kinds = [what for what, count in TRIALS.items() if number < count]
+            for number in range(max(count for count, *_ in TRIALS.values())):
+                kinds = [what for what, (count, *_) in TRIALS.items() if number < count]
                 for what, path in product(kinds, options.problems):
                     yield from product(["problem"], [path], OBJECTIVES, [what], [number])
 
@@ -126,22 +126,18 @@ class Stress(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Tables of each part, and every finding."""
-        findings = [(name_case(row), *finding) for row in rows for finding in row["findings"]]
-        findings += [
-            (name_case(row), "warning", f"printed: {row['printed']}")
-            for row in rows
-            if "printed" in row
-        ]
-        findings += compare_values([row for row in rows if row["case"][0] == "problem"])
-        parts = list[str | Table]()
-        for kind, title, describe in (
+        groups, findings, parts = group(rows, "part"), list[Any](), list[str | Table]()
+        for row in rows:
+            printed = [("warning", f"printed: {row['printed']}")] if "printed" in row else []
+            findings += ((row["name"], *finding) for finding in [*row["findings"], *printed])
+        findings += compare_values(groups.get("problem", []))
+        for part, title, describe in (
             ("scene", "Generated scenes", _describe_scenes),
             ("file", "Damaged files", _describe_files),
             ("problem", "Problems with noise and with other masses and forces", _describe_trials),
         ):
-            mine = [row for row in rows if row["case"][0] == kind]
-            if mine:
-                parts += [f"## {title}", *describe(mine)]
+            if part in groups:
+                parts += [f"## {title}", *describe(groups[part])]
         counted = Counter(kind for _, kind, _ in findings)
         kinds = dict.fromkeys([*KINDS, *counted])
         parts.append(Table(["finding", "number:d"], [(kind, counted[kind]) for kind in kinds]))
@@ -207,7 +203,7 @@ def _compare(one: Row, other: Row) -> list[Finding]:
 
 def change(table: Mapping[str, Any], what: str, rng: np.random.Generator) -> dict[str, Any]:
     """A problem file's table with noise, or with other masses, friction, drag and torque limits."""
-    keys, share = CHANGES[what]
+    _, keys, share = TRIALS[what]
 
     def vary(key: str, value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -253,9 +249,10 @@ def _describe_scenes(rows: Sequence[Row]) -> list[Table]:
 
 
 def _describe_files(rows: Sequence[Row]) -> list[Table]:
-    kinds = sorted({row["kind"] for row in rows})
-    statuses = [[str(row["status"]) for row in rows if row["kind"] == kind] for kind in kinds]
-    table = [(kind, len(mine), _count(mine)) for kind, mine in zip(kinds, statuses, strict=True)]
+    table = [
+        (kind, len(mine), _count(str(row["status"]) for row in mine))
+        for kind, mine in sorted(group(rows, "kind").items())
+    ]
     return [Table(["files", "number:d", "exit status"], table)]
 
 
@@ -288,64 +285,58 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
         t = np.unique(np.concatenate([np.linspace(0.0, duration, 401), inside.ravel()]))
         rows = motion.evaluate(t)
-        texts = _check_phase(problem, phase, rows)
-        middles = motion.evaluate((t[1:] + t[:-1]) / 2)
-        texts += check_rates(problem.scene, t, rows, middles)
         # The torques as functions of time are those of the motion, between their steps.
         near = np.abs((start + t)[:, None] - plan.torque.breaks).min(axis=1)
         miss = np.abs(plan.torque.at(start + t) - rows.tau)[near > 1e-9 * plan.duration]
         share = (miss / problem.scene.torque_limit).max(initial=0.0)
-        texts += [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
-        texts += _check_ends(problem, phase, before, rows)
+        misses = [(share, 1e-4, f"the torque profile is {share:.2g} of the limit off")]
+        misses += _list_misses(problem, phase, rows)
+        misses += _list_missed_ends(problem, phase, before, rows)
+        misses += _list_missed_rates(problem.scene, t, rows, motion.evaluate((t[1:] + t[:-1]) / 2))
+        faults += [f"phase {phase.number}: {text}" for size, most, text in misses if size > most]
         before = np.array([rows.z[-1], rows.z_dot[-1]])
-        faults += [f"phase {phase.number}: {text}" for text in texts]
     return faults
 
 
-def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
+Miss = tuple[float, float, str]  # an amount, the most that is allowed, and what is wrong beyond it
+
+
+def _list_misses(problem: Problem, phase: Phase, rows: Samples) -> Iterator[Miss]:
     """Contacts, overlaps, forces and limits of a phase, by `verification.newton_euler`."""
     scene, formation, scales = problem.scene, phase.formation, problem.scene.scales
     residuals = balance(scene, formation.contacts, formation.rolling, rows, STILL)
     size, _, text = residuals.find_worst()
-    texts = [text] if size > ROUNDING else []
-    for k, name in enumerate(formation.names):
+    yield size, ROUNDING, text
+    for name, c_n in zip(formation.names, rows.c_n.T, strict=True):
         touch = locate(scene, name, rows.z)
         beyond = -min(touch.low.min(), touch.high.min()) / scales.length
-        if beyond > OVERLAP:
-            texts.append(f"{name} is {beyond:.2g} of the scene's length beyond its feature")
+        yield beyond, OVERLAP, f"{name} is {beyond:.2g} of the scene's length beyond its feature"
         # A normal force may lack what `verification.verify` allows.
-        lack = problem.epsilon * (1 - 2e-3) - rows.c_n[:, k].min()
-        if lack > ROUNDING * scales.force:
-            texts.append(f"c_n of {name} is {lack:.3g} N short of epsilon")
+        lack = problem.epsilon * (1 - 2e-3) - c_n.min()
+        yield lack, ROUNDING * scales.force, f"c_n of {name} is {lack:.3g} N short of epsilon"
     for pair, gap in clearances(scene, rows.z).items():
-        if gap.min() < -OVERLAP * scales.length:
-            texts.append(f"{pair} overlap by {-gap.min():.3g} m")
-    turned = zip((*formation.names, "joint 1", "joint 2"), residuals.against.T, strict=True)
-    texts += [
-        f"friction of {name} is not Coulomb's for its sliding"
-        for name, flags in turned
-        if flags.any()
-    ]
+        yield -gap.min(), OVERLAP * scales.length, f"{pair} overlap by {-gap.min():.3g} m"
+    for name, flags in zip(
+        (*formation.names, "joint 1", "joint 2"), residuals.against.T, strict=True
+    ):
+        yield flags.sum(), 0, f"friction of {name} is not Coulomb's for its sliding"
     for text, values, limits in (
         ("tau_{} exceeds its limit by {:.2g} of it", rows.tau, scene.torque_limit),
         ("joint {} exceeds its speed by {:.2g} of it", rows.z_dot[:, 3:], scene.speed_limit),
     ):
-        share = np.abs(values).max(axis=0) / limits - 1
-        texts += [text.format(j + 1, share[j]) for j in (0, 1) if share[j] > 1e-5]
-    return texts
+        for j, share in enumerate(np.abs(values).max(axis=0) / limits - 1, start=1):
+            yield share, 1e-5, text.format(j, share)
 
 
-def check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list[str]:
+def _list_missed_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> Iterator[Miss]:
     """Whether z' is the derivative of z, and z'' that of z', as well as samples can tell.
 
     Simpson's rule takes instants, at `rows`, and those halfway between, at `middles`. A step of the
     acceleration there, or a kink, changes what it gives by no more than what the instants about it
     show: with the ends alone, a kink and a curvature could cancel in them.
     """
-    texts, h = [], np.diff(t)[:, None]
-    if not (h > 0).all():
-        return ["instants of a phase without a duration"]
-    unit = np.array([1.0, 1.0, *[1.0 / scene.scales.length] * 3])
+    h, unit = np.diff(t)[:, None], np.array([1.0, 1.0, *[1.0 / scene.scales.length] * 3])
+    yield (h <= 0).sum(), 0, "instants of a phase without a duration"
     for what, value, rate, middle in (
         ("z", rows.z, rows.z_dot, middles.z_dot),
         ("z'", rows.z_dot, rows.z_ddot, middles.z_ddot),
@@ -355,36 +346,33 @@ def check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list
         every = np.insert(rate, range(1, len(rate)), middle, axis=0)
         every = np.pad(every, ((2, 2), (0, 0)), "edge")
         span = np.ptp(sliding_window_view(every, 7, axis=0)[::2], axis=2)
-        tiny = 1e-7 * unit * float((np.abs(value) / unit).max())
-        excess = miss - (h * span + tiny)
-        if (excess > 0).any():
-            at, k = np.unravel_index(int(excess.argmax()), excess.shape)
-            texts.append(f"{what} and its rate differ by {miss[at, k]:.3g} in row {k}")
-    return texts
+        excess = miss - h * span - 1e-7 * unit * float((np.abs(value) / unit).max())
+        at, k = np.unravel_index(int(excess.argmax()), excess.shape)
+        text = f"{what} and its rate differ by {miss[at, k]:.3g} in row {k}"
+        yield excess.max(), 0, text
 
 
-def _check_ends(problem: Problem, phase: Phase, before: Array | None, rows: Samples) -> list[str]:
+def _list_missed_ends(
+    problem: Problem, phase: Phase, before: Array | None, rows: Samples
+) -> Iterator[Miss]:
     """Whether a phase goes on from where the one before ended, and ends as it has to."""
-    scene, until, texts = problem.scene, phase.until, []
+    scene, until = problem.scene, phase.until
     size, z, offs = scene.scales.length, rows.z[-1], [0.0]
     fastest, speed = float(np.abs(rows.z_dot).max()), scene.scales.speed
     if before is not None:
-        if np.abs(rows.z[0] - before[0]).max() > 1e-6 * max(1.0, size):
-            texts.append("starts somewhere else than the phase before ends")
-        step = np.abs(rows.z_dot[0] - before[1])[:2].max()
-        struck = problem.phases[phase.index - 1].end is End.IMPACT
-        if not struck and step > 1e-5 * max(speed, fastest):
-            texts.append(f"velocity steps by {step:.3g} m/s at the start")
+        away, most = np.abs(rows.z[0] - before[0]).max(), 1e-6 * max(1.0, size)
+        yield away, most, "starts somewhere else than the phase before ends"
+        if problem.phases[phase.index - 1].end is not End.IMPACT:
+            step = np.abs(rows.z_dot[0] - before[1])[:2].max()
+            text = f"velocity steps by {step:.3g} m/s at the start"
+            yield step, 1e-5 * max(speed, fastest), text
     if until.contact is not None:
         offs.append(float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size)
     offs += [abs(z[row] - value) / (1.0 if row else size) for row, value in until.poses]
-    if max(offs) > 1e-5:
-        texts.append(f"ends {max(offs):.3g} from {until}")
+    yield max(offs), 1e-5, f"ends {max(offs):.3g} from {until}"
     if phase.end is End.REST:
-        left = np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])
-        if left.max() > 1e-5 * max(speed, fastest * size):
-            texts.append(f"ends at {left.max():.3g} m/s, not at rest")
-    return texts
+        left = (np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])).max()
+        yield left, 1e-5 * max(speed, fastest * size), f"ends at {left:.3g} m/s, not at rest"
 
 
 _LINK = {"length": 0.11, "radius": 0.005, "inertia": 0.005, "viscous": 0.01, "dry": 0.01}

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,8 +37,8 @@ Case = tuple[Any, ...]  # plain values that say what is run: the name of its rec
 Row = dict[str, Any]
 """What came of a case, as plain values; `findings` is what must not be.
 
-Added are `case`, the `seconds` of processor time, and `memory`, by which it has raised the peak of
-its process [MB].
+Added are `case`, the entries that have names, `name`, the `seconds` of processor time, and
+`memory`, by which it has raised the peak of its process [MB].
 """
 Findings = tuple[Sequence[str | Table], list[str]]
 PACKAGES = ("casadi", "numpy", "scipy", "toppra", "yapss")  # those that are there are stated
@@ -51,6 +52,7 @@ class Study:
     timed = alone = False  # whether cases are run one at a time, and each in a process of its own
     strict = False  # whether warnings are errors
     shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
+    keys: tuple[str, ...] = ()  # names of the first entries of cases, as rows have them
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
     options = ""  # table of options beside those that every study has, as of `read_options`
 
@@ -92,9 +94,17 @@ class Study:
         return 60.0
 
 
-def name_case(row: Row) -> str:
+def name_case(case: Iterable[Any]) -> str:
     """A case in words."""
-    return " ".join(map(str, row["case"]))
+    return " ".join(map(str, case))
+
+
+def group(rows: Iterable[Row], *keys: str) -> dict[Any, list[Row]]:
+    """Rows by one of their entries, or by several, in the order in which these come first."""
+    groups, find = dict[Any, list[Row]](), itemgetter(*keys)
+    for row in rows:
+        groups.setdefault(find(row), []).append(row)
+    return groups
 
 
 def run_study(
@@ -125,10 +135,13 @@ def run_study(
             ahead = (time.monotonic() - wall_start) / count * (len(left) - count) / 60
             text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
             progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
-    rows = [done[json.dumps(case)] for case in cases]
+    named = (
+        dict(zip(study.keys, case, strict=False)) | {"name": name_case(case)} for case in cases
+    )
+    rows = [name | done[json.dumps(case)] for name, case in zip(named, cases, strict=True)]
     good = [row for row in rows if "failed" not in row]
     parts, violations = study.report(good, options)
-    findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row]
+    findings = [f"{row['name']}: {row['failed']}" for row in rows if "failed" in row]
     findings += violations
     parts = [describe_machine(), *parts]
     if findings:

@@ -35,13 +35,13 @@ def play(
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.ERROR)
-    diagram, plant, pairs = _build(problem.scene, steps, setting)
+    diagram, plant, numbers = _build(problem.scene, steps, setting)
     simulator = Simulator(diagram)
     log.setLevel(level)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
-    shares = {name: len(engine.find_pairs(name, corners)) * stiffness for name in stretch.c_n}
-    plant.SetPositions(context, engine.press_in(problem, stretch, shares))
+    pairs = engine.list_pairs(problem.scene)
+    stiffness = dict.fromkeys((p.name for p in pairs), _find_stiffness(problem.scene, setting))
+    plant.SetPositions(context, engine.press_in(problem, stretch, stiffness))
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
@@ -62,14 +62,14 @@ def play(
             for k in range(contact_results.num_point_pair_contacts()):
                 info = contact_results.point_pair_contact_info(k)
                 both = info.point_pair()
-                number = pairs[frozenset((both.id_A, both.id_B))]
+                number = numbers[frozenset((both.id_A, both.id_B))]
                 total[number] += abs(info.contact_force() @ both.nhat_BA_W)
         return total / len(looks)
 
     def read() -> tuple[Array, Array]:
         return plant.GetPositions(context), plant.GetVelocities(context)
 
-    return engine.record(stretch, steps, engine.list_pairs(problem.scene), advance, read)
+    return engine.record(stretch, steps, pairs, advance, read)
 
 
 def _build(

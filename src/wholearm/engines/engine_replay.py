@@ -30,6 +30,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -309,11 +310,15 @@ def find_between(plan: Trajectory) -> Trajectory:
     return replay if same else plan
 
 
-def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float]) -> Array:
-    """The planned start with penetrations of planned force over stiffness [N/m], shape (5,).
+def press_in(
+    problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float] = MappingProxyType({})
+) -> Array:
+    """The planned start with penetrations of planned force over stiffness, shape (5,).
 
     It is the nearest such configuration in the metric of the kinetic energy. Contacts without a
     force, such as released ones, get a small gap: oscillations at the start would hit them.
+
+    `stiffness` is that of each pair of shapes [N/m]; without it all sink in a little.
     """
     scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
     touching = find_touching(scene, stretch.z)
@@ -323,9 +328,10 @@ def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, f
     # Of others what is independent: contacts at one place share all of their rows but rounding.
     independent, count = Independent(0.1), formation.n_contacts
     rows = [k for k, row in enumerate(A * weight) if independent.add(row) or k < count]
-    depth = np.full(len(contacts), -3e-7 * scene.scales.length)
-    for k, name in enumerate(formation.names):
-        depth[k] = stretch.c_n[name] / stiffness[name]
+    depth = scene.scales.length * np.where(np.arange(len(contacts)) < count, 1e-6, -3e-7)
+    for k, name in enumerate(formation.names if stiffness else ()):
+        stiff = sum(stiffness[pair] for pair in find_pairs(name, scene.polygon.n_vertices))
+        depth[k] = stretch.c_n[name] / stiff if stiff else 0.0
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
 
 

@@ -243,20 +243,12 @@ def play(
         return total / (end - start)
 
     # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
-    little = 1e-6 * problem.scene.scales.length
-    touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
-    data.qpos[:] = engine.press_in(problem, stretch, touching)
+    data.qpos[:], stiffnesses = engine.press_in(problem, stretch), np.zeros(len(pairs))
     mujoco.mj_forward(model, data)
-    stiffnesses = np.zeros(len(pairs))
     collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
-    names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
-    shares = {
-        name: sum(stiffnesses[names.index(pair)] for pair in engine.find_pairs(name, corners))
-        or np.inf
-        for name in stretch.c_n
-    }
+    stiffness = dict(zip((pair.name for pair in pairs), stiffnesses.tolist(), strict=True))
     mujoco.mj_resetData(model, data)
-    data.qpos[:], data.qvel[:] = engine.press_in(problem, stretch, shares), steps.v
+    data.qpos[:], data.qvel[:] = engine.press_in(problem, stretch, stiffness), steps.v
     # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
     mujoco.set_mju_user_warning(lambda _: None)
     state = lambda: (data.qpos.copy(), data.qvel.copy())  # noqa: E731
