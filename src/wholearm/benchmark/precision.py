@@ -43,7 +43,7 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import ONE, A, B, build_force_rows, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
-from ..planning.lower_bound import GIVE, PathTerms, bound_least_time
+from ..planning.lower_bound import bound_least_time
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
@@ -414,58 +414,77 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
     return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
 
 
+def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
+    """Limits at places of a curve, whose segments are `owner`."""
+    curve, point = instance.curve, instance.curve.evaluate(s)
+    forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
+    limits = make_limits(curve.formation, instance.problem.epsilon)
+    return PathLimits.of(limits, forces, point.z_s[:, 3:])
+
+
 def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
     import toppra
     from toppra.constraint import DiscretizationType, LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     toppra.setup_logging("ERROR")
-    path = PathTerms((instance.curve,), instance.problem.epsilon)
-    angles, owner = path.make_grid(int(setting))
-    s = path.place(angles)
-    # A bound relaxes limits, a plan does not.
-    rows = path.evaluate(np.column_stack([angles[:-1], angles[1:]]), owner).relax(-GIVE).rows
-    rows = rows[:, :, rows[..., A].any(axis=(0, 1))]
-    # At the second end the squared speed is b + 2 ds a. The last node begins no interval.
-    last = rows[-1:, [1, 1]]
-    rows[:, 1, :, A] += 2 * np.diff(s)[:, None] * rows[:, 1, :, B]
-    rows = np.concatenate([rows, last]).reshape(len(s), -1, rows.shape[-1])
-    below, zero = -np.eye(rows.shape[1]), np.zeros(rows.shape[1])
-    parameters = *(rows[..., column] for column in (A, B, ONE)), below, zero, None, None
-    limits = LinearConstraint()
+    length = instance.curve.length
+    apart = 1e-7 * length  # of grid points from a reversal between them
+    grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
+    for part in instance.curve.segments[:-1]:
+        near = np.abs(grid - part.stop) > 4 * apart
+        grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
+        grid.sort()
+    stops = [part.stop for part in instance.curve.segments[:-1]]
+    rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
+    constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
+    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
+
+    # The parameters of the limits, with the internal force eliminated, are those of the grid.
+    limits, columns = LinearConstraint(), (a, b, constant, below, zero, None, None, grid)
     limits.identical = True
     limits.set_discretization_type(DiscretizationType.Interpolation)
+    parameters = canlinear_colloc_to_interpolate(*columns, identical=True)
     limits.compute_constraint_params = lambda *_: parameters
-    places = toppra.SplineInterpolator(s, s[:, None])
+    path = toppra.SplineInterpolator(grid, grid[:, None])
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
-    planner = toppra.algorithm.TOPPRA([limits], places, gridpoints=s, **options)
+    planner = toppra.algorithm.TOPPRA([limits], path, gridpoints=grid, **options)
 
     def run() -> Plan:
         _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
         if speeds is None or not np.isfinite(speeds).all():
             return "no feasible parametrisation"
-        return _make_plan(instance, s, owner, np.asarray(speeds) ** 2)
+        return _make_plan(instance, grid, np.asarray(speeds))
 
     return run
 
 
-def _make_plan(instance: Instance, s: Array, owner: Numbers, b: Array) -> TorqueProfile:
-    """Torques by inverse dynamics, with the internal force linear between the nodes `s`.
+def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
+    """Torques by inverse dynamics, with the internal force linear between grid points.
 
-    `b` is the squared speed there, and `owner` the segments of the intervals.
+    The two points beside a reversal become one, with a step of the torques.
     """
-    curve, edges, steps = instance.curve, np.column_stack([s[:-1], s[1:]]), np.diff(s)
-    point, a = curve.evaluate(edges.ravel()), np.diff(b) / (2 * steps)
-    forces = inverse(curve.formation, *point[:3], directions_of(curve, np.repeat(owner, 2)))
-    limits = make_limits(curve.formation, instance.problem.epsilon)
-    ends = np.repeat(a, 2), np.column_stack([b[:-1], b[1:]]).ravel()
-    span = PathLimits.of(limits, forces, point.z_s[:, 3:]).find_internal_force_range(*ends)
-    internal = np.mean(span, axis=0).reshape(-1, 2)
-    elements = lay_out(edges, owner, (True, True))
-    share = (elements.s.reshape(-1, NODES) - edges[:, :1]) / steps[:, None]
-    within = (internal[:, :1] + share * np.diff(internal)).ravel()
-    profile = Profile(np.repeat(a, NODES), np.interp(elements.s, s, b), within)
-    motion = PathMotion(curve, elements, profile)
+    stops = np.array([part.stop for part in instance.curve.segments[:-1]])
+    for stop in stops:
+        k = int(np.searchsorted(grid, stop)) - 1
+        speed = (speeds[k] + speeds[k + 1]) / 2
+        grid, speeds = (
+            np.concatenate([part[:k], [middle], part[k + 2 :]])
+            for part, middle in ((grid, stop), (speeds, speed))
+        )
+    steps, b = np.diff(grid), speeds**2
+    a, owner = np.diff(b) / (2 * steps), np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
+    ends = [
+        np.mean(_limit(instance, grid[p], owner).find_internal_force_range(a, b[p]), axis=0)
+        for p in (slice(-1), slice(1, None))
+    ]
+    elements = lay_out(np.column_stack([grid[:-1], grid[1:]]), owner, (True, True))
+    each = np.repeat(np.arange(len(steps)), NODES)
+    part = (elements.s - grid[each]) / steps[each]
+    internal = ends[0][each] * (1 - part) + ends[1][each] * part
+    profile = Profile(a[each], np.interp(elements.s, grid, b), internal)
+    motion = PathMotion(instance.curve, elements, profile)
     breaks = np.append(motion.times[::NODES], motion.duration)
     return TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, 4)
 
