@@ -93,10 +93,12 @@ def replay_plan(
         plans = (_improve(planning, phase, check, report) for phase in suspects)
         better = next((plan for plan in plans if plan is not None), None)
         if better is None:
+            failed, reason = check.failure
+            first = "" if number == failed else f", which departs in phase {number} first"
             raise ReplayError(
-                f"the plan of phase {number} does not hold in its replay: "
-                f"{check.failure[1]}; other intervals or another objective may do, and "
-                "--no-replay (replay=False) leaves the check out"
+                f"the plan of phase {failed} does not hold in its replay{first}: {reason}; other "
+                "intervals or another objective may do, and --no-replay (replay=False) leaves the "
+                "check out"
             )
         planning = better
     assert isinstance(check.report, Report)
