@@ -105,6 +105,11 @@ _TABLES = {
     "object": OBJECT, "finger": FINGER, "friction": FRICTION, "start": START,
     "uncertainty": UNCERTAINTY, "goal": GOAL,
 }  # fmt: skip
+_PLACES = {
+    "the top of the file": TOP, "[object]": OBJECT, "[fingers.1] and [fingers.2]": FINGER,
+    "[start]": START, "[[phases]]": PHASE, "[goal]": GOAL,
+}  # fmt: skip
+"""Tables by their place, as a hint where a key stands in another one."""
 
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
@@ -316,7 +321,9 @@ def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
     for name in value:
         if name not in known:
             allowed = f"allowed are {', '.join(sorted(known))}"
-            raise InputError("", f"{prefix}{name}", f"unknown key; {suggest(name, known)}{allowed}")
+            place = next((place for place, table in _PLACES.items() if name in table), "")
+            hint = f"it belongs to {place}; " if place else suggest(name, known)
+            raise InputError("", f"{prefix}{name}", f"unknown key; {hint}{allowed}")
     for name in sorted(name for name, field in known.items() if field.required):
         if name not in value:
             raise InputError("", f"{prefix}{name}", "is missing")
