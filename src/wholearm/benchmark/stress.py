@@ -347,6 +347,7 @@ def _list_missed_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) 
         every = np.pad(every, ((2, 2), (0, 0)), "edge")
         span = np.ptp(sliding_window_view(every, 7, axis=0)[::2], axis=2)
         excess = miss - h * span - 1e-7 * unit * float((np.abs(value) / unit).max())
+        excess = np.nan_to_num(excess, nan=-np.inf)
         at, k = np.unravel_index(int(excess.argmax()), excess.shape)
         text = f"{what} and its rate differ by {miss[at, k]:.3g} in row {k}"
         yield excess.max(), 0, text

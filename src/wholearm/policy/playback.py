@@ -267,9 +267,9 @@ def _read_tables(
         array = tables[name] = arrays.get(key, none if name in LATER else None)
         if array is None:
             raise InputError("", key, "array is missing")
-        if name in LATER and not array.size:
-            continue
         needed = [sizes.get(n, n) for n in shape]
+        if name in LATER and isinstance(shape[0], str) and array.shape[:1] == (0,):
+            needed[0] = 0
         fits = array.dtype.kind == "f" and array.ndim == len(shape) and np.isfinite(array).all()
         if not fits or any(w not in (n, "any") for w, n in zip(needed, array.shape, strict=True)):
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape "
