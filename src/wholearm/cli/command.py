@@ -508,7 +508,6 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
 
 def _solve(options: argparse.Namespace) -> int:
     from ..planning.plan import solve_with
-    from ..planning.replay_check import make_table
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
@@ -526,15 +525,18 @@ def _solve(options: argparse.Namespace) -> int:
     for key in ("cache", "jobs"):
         if getattr(options, key) is not None and not problem.goals:
             raise InputError("", f"--{key}", "is for problems with [goal]")
-    route_text = ""
+    route_text, table = "", None
     try:
         if problem.goals:
             answer = find_route(options, problem)
             plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress, options.time_limit)
-        given = plan.problem, plan.trajectory, options.replay, options.sample_rate, interpolation
-        table = None if options.torques is None else make_table(*given)
+        if options.torques is not None:
+            from ..planning.replay_check import make_table
+
+            sampling = options.sample_rate, interpolation
+            table = make_table(plan.problem, plan.trajectory, options.replay, *sampling)
     except WholearmError as error:
         # Of bad input one line says everything.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):

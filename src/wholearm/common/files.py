@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -106,6 +107,17 @@ def make_folder(path: str, key: str = "") -> None:
     """Make a folder if it is not there; an `InputError` that names the key if it cannot be made."""
     with name_file(path, key, "cannot be made"):
         os.makedirs(path, exist_ok=True)
+
+
+@cache
+def digest_package() -> str:
+    """A digest of the source code of the package."""
+    import hashlib
+
+    folder, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _is_special(target: str) -> bool:

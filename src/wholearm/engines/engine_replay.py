@@ -30,7 +30,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -311,7 +310,7 @@ def find_between(plan: Trajectory) -> Trajectory:
 
 
 def press_in(
-    problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float] = MappingProxyType({})
+    problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float] | None = None
 ) -> Array:
     """The planned start with penetrations of planned force over stiffness, shape (5,).
 
@@ -329,9 +328,10 @@ def press_in(
     independent, count = Independent(0.1), formation.n_contacts
     rows = [k for k, row in enumerate(A * weight) if independent.add(row) or k < count]
     depth = scene.scales.length * np.where(np.arange(len(contacts)) < count, 1e-6, -3e-7)
-    for k, name in enumerate(formation.names if stiffness else ()):
-        stiff = sum(stiffness[pair] for pair in find_pairs(name, scene.polygon.n_vertices))
-        depth[k] = stretch.c_n[name] / stiff if stiff else 0.0
+    if stiffness is not None:
+        for k, name in enumerate(formation.names):
+            stiff = sum(stiffness[pair] for pair in find_pairs(name, scene.polygon.n_vertices))
+            depth[k] = stretch.c_n[name] / stiff if stiff else 0.0
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
 
 

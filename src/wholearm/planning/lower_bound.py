@@ -134,17 +134,19 @@ def bound_least_time(
     """
     path = PathTerms(curves, epsilon)
     grid, b_guess, bound, tries = path.make_grid(intervals), None, None, 0
-    for _ in range(grids):
+    for left in reversed(range(grids)):
         try:
             bound, losses, motion, time = _bound(path, grid, b_guess)
         except NoMotionError as error:
             tries += 1
-            if tries > _TRIES:
+            if tries > _TRIES or not left:
                 break
             parts = np.ones(len(grid.owners), dtype=np.int64)
             parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
             grid, b_guess = grid.split(parts), None
             continue
+        if not left:
+            break
         share = losses / (3e-8 * time)  # relative tolerance
         # Losses at switches and kinks fall with the square or the third power of the interval.
         parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError
-from ..common.files import make_folder, write_whole
+from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..planning.options import Objective, PlanOptions
@@ -239,11 +239,8 @@ def store_roadmap(folder: Path, key: str, roadmap: Roadmap) -> None:
 
 def _name_file(folder: Path, key: str) -> Path:
     """The file of a scene: another one for other versions, and for other code of this one."""
-    versions = f"{ca.__version__} {np.__version__} {sys.version}"
-    digest = hashlib.sha256(f"{versions} {key}".encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(path.read_bytes())
-    return folder / f"{digest.hexdigest()[:32]}.chart"
+    versions = f"{digest_package()} {ca.__version__} {np.__version__} {sys.version}"
+    return folder / f"{hashlib.sha256(f'{versions} {key}'.encode()).hexdigest()[:32]}.chart"
 
 
 NOT_CONSIDERED = (

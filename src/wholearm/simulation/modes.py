@@ -85,7 +85,7 @@ class Mode:
     formation: Formation
     holders: tuple[tuple[int, ...], ...]
 
-    @property
+    @cached_property
     def n_constraints(self) -> int:
         """Number of constraints, and of independent forces c = [c_n; c_t or T; f]."""
         return self.formation.n_contacts + len(self.holders)

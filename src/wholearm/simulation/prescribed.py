@@ -188,7 +188,6 @@ class Replay(Run):
         sizes = [rows.cone.stop, self.turning.stop - rows.cone.stop, count, 1, 1]
         # Of speeds 2e-13 is rounding.
         self.slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
-        self.has_one_freedom = mode.n_constraints >= 4
 
     def measure(self) -> Array:
         """Event values after the step just made, scaled.
@@ -203,7 +202,7 @@ class Replay(Run):
         ends.evaluate()
         self.distance, self.rate = ends.values[-2:].tolist()
         speed = 1.0
-        if self.has_one_freedom:
+        if self.mode.n_constraints >= 4:
             size = float(self.heading @ (self.system.mass * out.y[5:10]))
             speed = size / (scales.speed * scales.mass**0.5)
         # Those of the coordinates of the object, between, are zero.
@@ -224,8 +223,8 @@ class Replay(Run):
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        if self.has_one_freedom and (v := self.v).any():
-            self.heading = v / math.sqrt(self.system.mass @ v**2)
+        if self.mode.n_constraints >= 4 and self.v.any():
+            self.heading = self.v / math.sqrt(self.system.mass @ self.v**2)
         self.require_inertia()
 
     def require_inertia(self) -> None:

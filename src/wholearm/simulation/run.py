@@ -353,9 +353,8 @@ class Run(ABC):
 
     def read_outputs(self, t: float) -> Record:
         """The outputs of the steps as a record at time `t` [s]."""
-        y, acceleration, tau, c_n, c_t = map(np.copy, self.s.outputs[:5])
-        state = y, acceleration, tau, c_n, c_t
-        return Record(t, self.phase_index, self.modes.kept, self.impact, *state)
+        seen: Any = (part.copy() for part in self.s.outputs[:5])
+        return Record(t, self.phase_index, self.modes.kept, self.impact, *seen)
 
 
 @runtime_checkable

@@ -554,9 +554,15 @@ class PathIterate:
         profile = Elements(self.data.grid, self.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        fresh: dict[str, Any] = {"tightening": Tightening(), "multipliers": {}}
-        fresh |= {"meshes": self.meshes + 1, "before": replace(self, before=None)}
-        return replace(self, parts=parts, profile=profile, **fresh)
+        return replace(
+            self,
+            parts=parts,
+            profile=profile,
+            tightening=Tightening(),
+            multipliers={},
+            meshes=self.meshes + 1,
+            before=replace(self, before=None),
+        )
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
