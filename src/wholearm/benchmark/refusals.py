@@ -299,19 +299,33 @@ def _split(rows: Expression, unknowns: Expression) -> tuple[Any, Array]:
 def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
     """Least ratio of a principal minor to that without friction, on both sides, shape (n,).
 
-    Forces are not unique at 0 and below.
+    A contact that does not slide sticks, or slips either way. Forces are not unique at 0 and below.
     """
-    signs, rows = _signs(formation, z, z_s), constrain(formation, z)[1]
-    light, ratios = rows / formation.scene.mass_diagonal, list[Array]()
+    rates = np.abs(slides(formation, z, z_s)[:, : formation.n_contacts]).max(axis=0)
+    still = [c for c, rate in zip(formation.contacts, rates, strict=True) if rate < 1e-9]
+    held = replace(formation, rolling=tuple({*formation.rolling, *still}))
+    signs, rows = _signs(formation, z, z_s), constrain(held, z)[1]
+    light, ratios = rows / formation.scene.mass_diagonal, [np.ones(len(z))]
     without = light @ rows.transpose(0, 2, 1)
-    # The contact of each row.
-    owners = np.array([*range(formation.n_contacts), *formation.rolling_rows])
+    slips, options = list[Array](), list[list[Any]]()
+    for k, name in enumerate(formation.names):
+        # Of each choice the rows of accelerations, and the columns of forces.
+        options.append([((), ()), ((k,), (k,))])
+        if k in held.rolling_rows:
+            touch, column = locate(formation.scene, name, z), rows.shape[1] + len(slips)
+            slips += [touch.normal - sign * touch.friction * touch.tangent for sign in (1, -1)]
+            sticks = (k, formation.n_contacts + held.rolling_rows.index(k))
+            options[k][1:] = [(sticks, sticks), ((k,), (column,)), ((k,), (column + 1,))]
     for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        matrix = light @ _push(formation, z, side)
-        for taken in product([False, True], repeat=formation.n_contacts):
-            chosen = np.flatnonzero(np.array(taken)[owners])
-            minor = np.ix_(np.arange(len(z)), chosen, chosen)
-            ratios.append(np.linalg.det(matrix[minor]) / np.linalg.det(without[minor]))
+        columns = [_push(held, z, side), *(slip[:, :, None] for slip in slips)]
+        matrix = light @ np.concatenate(columns, axis=2)
+        for choices in product(*options):
+            of_rows, forces = (sum(parts, ()) for parts in zip(*choices, strict=True))
+            smooth = without[:, of_rows][:, :, of_rows]
+            below = np.linalg.det(smooth)
+            independent = below > 1e-12 * np.einsum("nii->ni", smooth).prod(axis=1)
+            minor = np.linalg.det(matrix[:, of_rows][:, :, forces])
+            ratios.append(np.divide(minor, below, out=np.ones_like(below), where=independent))
     return np.asarray(np.min(ratios, axis=0))
 
 
