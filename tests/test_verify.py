@@ -341,15 +341,15 @@ def test_torques_for_nothing() -> None:
     assert "-" in report.to_text()
 
 
-def test_torques_and_speeds_beyond_their_limits_are_warnings() -> None:
+def test_torques_and_speeds_beyond_their_limits_are_warnings_or_failures_of_a_plan() -> None:
     problem, trajectory = plan()
-    report = verify(problem.with_(torque_limit=1.0), trajectory.torque)
-    assert report.ok
-    assert any("above its limit 1 N m" in text for text in report.warnings)
+    report = verify(weak := problem.with_(torque_limit=1.0), trajectory.torque)
+    assert report.ok and any("above its limit 1 N m" in text for text in report.warnings)
+    assert any("above its limit 1 N m" in text for text in verify(weak, trajectory).failures)
     rates = np.abs(trajectory.theta_dot[:, 0])
     limit = float(f"{0.9 * rates.max():.4g}")
-    report = verify(problem.with_(speed_limit1=limit), trajectory.torque)
-    assert report.ok
+    report = verify(slow := problem.with_(speed_limit1=limit), trajectory.torque)
+    assert report.ok and not verify(slow, trajectory).ok
     (text,) = (text for text in report.warnings if text.startswith("speed limit of finger 1 = "))
     over, when = re.findall(r"exceeded by (\S+) rad/s at t = (\S+) s, phase \d$", text)[0]
     assert float(over) == pytest.approx(rates.max() - limit, rel=5e-3)

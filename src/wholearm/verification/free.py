@@ -29,6 +29,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
+from .verify import describe_motors
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -74,11 +75,12 @@ def verify_free(
     if progress is not None:
         progress("simulating the whole")
     whole = simulate_free(problem, torque if plan is None else plan, **options)
-    warnings = warn("whole", whole)
+    warnings, beyond = warn("whole", whole), [text for _, text in describe_motors(problem, torque)]
     if plan is None:
         phases, failures = _follow(whole, allowed)
+        warnings = [*beyond, *warnings]
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
-    failures, alone = [], []
+    failures, alone = beyond, []
     for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared

@@ -190,26 +190,26 @@ def judge(
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += describe_failures(simulation, phases, gap if reached else None, allowance)
     thin = list(describe_thin_margins(simulation, phases))
-    warnings = _describe_torques(problem, torque)
-    warnings += [
+    warnings = [
         f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
         "can hold everything at rest under its torques"
         for phase in phases
         if phase.wedged
     ]
+    # A replay may miss limits by as much as it may depart from its plan.
+    allowed = MISSED if plan is None else allowance.departure
+    missed = [
+        (sum(phase.start <= time for phase in phases), text)
+        for time, text in describe_motors(problem, torque)
+    ]
     for phase in problem.phases[: len(phases)]:
-        warnings += describe_misses(phase, simulation)
-    for time, text in describe_motors(problem, torque):
-        number = sum(phase.start <= time for phase in phases)
-        if plan is None:
-            warnings.append(text)
-        else:
-            failures.append(results.Failure(max(number, 1), text))
+        missed += [(phase.number, text) for text in describe_misses(phase, simulation, allowed)]
     if plan is not None:
+        failures += [results.Failure(max(number, 1), text) for number, text in missed]
         # The departure of later phases follows from that of the first.
         failures += thin + list(describe_departures(problem, phases, allowance))[:1]
     else:
-        warnings += [failure.text for failure in thin]
+        warnings += [text for _, text in missed] + [failure.text for failure in thin]
     return results.Report(
         name=problem.name,
         epsilon=problem.epsilon,
@@ -314,20 +314,6 @@ def _measure(difference: Array, t: Array, length: float) -> Deviation:
     return Deviation(float(position.max()), float(angle.max()), when)
 
 
-def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
-    """Sentences on torques beyond their limits."""
-    peaks = np.abs(torque.at_places(np.linspace(-1, 1, 9))).max(axis=2)
-    texts = []
-    for joint, limit in enumerate(problem.scene.torque_limit):
-        piece = int(peaks[:, joint].argmax())
-        if peaks[piece, joint] > limit * (1 + MISSED):
-            texts.append(
-                f"tau_{joint + 1} reaches {peaks[piece, joint]:.3g} N m, above its limit "
-                f"{limit:g} N m, near t = {torque.breaks[piece]:.5g} s"
-            )
-    return texts
-
-
 def _balance(simulation: Simulation) -> results.EnergyBalance:
     scene, energies = simulation.problem.scene, simulation.energies
     ends = simulation.z_dot[[0, -1]]
@@ -381,8 +367,11 @@ def _find_least(
         yield name, least, time
 
 
-def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
-    """Sentences on limits that a phase exceeds, other than those of forces and torques alone."""
+def describe_misses(phase: Phase, simulation: Simulation, allowed: float) -> list[str]:
+    """Sentences on limits that a phase exceeds by `allowed` of their scale.
+
+    Those of forces and torques alone are left out.
+    """
     formation, rows = phase.formation, np.flatnonzero(simulation.phase == phase.index)
     limits, t = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE), simulation.t[rows]
     if not limits.limits:
@@ -394,7 +383,7 @@ def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
     return [
         f"{limit.text} is exceeded by {amount:.3g} {limit.unit} at t = {t[worst]:.5g} s, phase "
         f"{phase.number}"
-        for limit, amount, worst in limits.list_misses(y @ limits.rows.T, MISSED)
+        for limit, amount, worst in limits.list_misses(y @ limits.rows.T, allowed)
     ]
 
 
@@ -405,30 +394,28 @@ def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
 
 
 def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
-    """What misses cannot follow, with the time of the worst place of each kind [s]."""
-    scene = problem.scene
-    if not scene.has_slow_motors:
-        return []
-    x = np.linspace(-1, 1, 33)
-    rates = torque.slopes.at_places(x)
-    commands = torque.at_places(x) + scene.actuator_lag[:, None] * rates
+    """Sentences on what motors cannot give, with the time of the worst place of each kind [s]."""
+    scene, x = problem.scene, np.linspace(-1, 1, 33)
+    torques, rates = torque.at_places(x), torque.slopes.at_places(x)
+    commands = torques + scene.actuator_lag[:, None] * rates
     lasts = np.diff(torque.breaks)[:, None]
     times = torque.breaks[:-1, None] + lasts * (1 + x) / 2
     misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
     for joint, (limit, fastest, lag) in enumerate(limits):
-        if np.isinf(fastest) and not lag:
-            continue
         # Excess of a rate over a piece that is less than a step counts as none. Case: phase 2 of
         # new polygon 36 of seed 51, with pieces of 1 us.
         step, limited = 1e-5 * limit, f"where its rate limit is {fastest:g} N m/s"
         why = limited if np.isfinite(fastest) else "where its motor lags"
-        rate, command = f"above its rate limit {fastest:g} N m/s", f"above its limit {limit:g} N m"
-        for of, when, most, what, against in (
-            (torque.jumps, torque.breaks[1:-1], step, "steps by {:.3g} N m", why),
-            (rates, times, 1.001 * fastest + step / lasts, "changes at {:.4g} N m/s", rate),
-            (commands, times, 1.001 * limit, "takes a command of {:.4g} N m", command),
-        ):
+        rate, above = f"above its rate limit {fastest:g} N m/s", f"above its limit {limit:g} N m"
+        kinds = [(torques, times, (1 + MISSED) * limit, "reaches {:.3g} N m", above)]
+        if np.isfinite(fastest) or lag:
+            kinds += [
+                (torque.jumps, torque.breaks[1:-1], step, "steps by {:.3g} N m", why),
+                (rates, times, 1.001 * fastest + step / lasts, "changes at {:.4g} N m/s", rate),
+                (commands, times, 1.001 * limit, "takes a command of {:.4g} N m", above),
+            ]
+        for of, when, most, what, against in kinds:
             sizes = np.abs(of[:, joint])
             over = (sizes - most).ravel()
             if over.max(initial=0.0) > 0:
