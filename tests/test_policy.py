@@ -318,10 +318,8 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(path)]) == 0
     loaded = Policy.load(path)
     theta, rates = problem.start[3:].tolist(), [0.0, 0.0]
-    loaded.reset()
     policy.reset()
     assert loaded.step(theta, rates) == pytest.approx(policy.step(theta, rates), rel=1e-13)
-    # The loop needs neither CasADi nor SciPy.
     code = (
         "import sys; from wholearm.policy.playback import Policy; "
         f"p = Policy.load({str(path)!r}); p.reset(); p.step({theta}, {rates}); "
@@ -330,6 +328,8 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(InputError, match="phase: 3 given"):
         policy.reset(3)
+    with pytest.raises(InputError, match="theta_dot: nan, 0 given"):
+        policy.step(theta, [np.nan, 0.0])
     np.savez(path, **{**np.load(path), "keeps_1": np.zeros(0)})
     with pytest.raises(InputError, match=r"keeps_1: float64 of shape \(0,\) given"):
         Policy.load(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -182,7 +183,13 @@ class Policy(Result):
         forces  measured normal forces [N] by names of contacts (`v3-finger1`): 0 of open ones,
                 missing or NaN without a sensor. They correct internal forces along curves and show
                 gained contacts.
+
+        InputError, and no change of the policy, if an angle or a speed is not finite.
         """
+        for name, values in (("theta", theta), ("theta_dot", theta_dot)):
+            if len(values) != 2 or not all(map(math.isfinite, values)):
+                given = ", ".join(f"{value:g}" for value in values)
+                raise InputError("", name, f"{given} given; two finite numbers are needed")
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
         if law.over and self.index < self.last:
