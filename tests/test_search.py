@@ -111,13 +111,12 @@ def test_under_rate_limits_motions_begin_on_borders_where_torques_hold() -> None
         assert (max(along, default=0) > 0.9 * np.abs(rates).sum()) == (not border.limits.begins)
 
 
-def test_a_problem_with_a_goal_is_planned() -> None:
-    problem = read({"flush": 0, "x": 0.03})
-    answer = find_route(problem)
+@pytest.mark.parametrize("turned", [{"flush": 0}, {"phi_deg": -1.984}], ids=str)
+def test_a_problem_with_a_goal_is_planned(turned: dict[str, float]) -> None:
+    answer = find_route(read(turned | {"x": 0.03}))
     assert answer.bound is not None and answer.gap is not None and answer.gap < 0.02
-    assert [phase.formation.names for phase in answer.problem.phases] == [
-        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2")
-    ]
+    names = [phase.formation.names for phase in answer.problem.phases]
+    assert names == [("v0-palm", "v1-palm", "v2-finger1", "v5-finger2")]
     assert verify(answer.problem, answer.plan).exit_status == 0
     phases = tomllib.loads(answer.to_text())["phases"]
     again = build_problem(table_of() | {"phases": phases})

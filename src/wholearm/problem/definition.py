@@ -190,25 +190,37 @@ class Phase:
 )
 @dataclass(frozen=True)
 class Goal:
-    """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad]."""
+    """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad].
+
+    Both where that edge lies on the palm at that angle.
+    """
 
     flush: int | None = None
     phi: float | None = None
     x: float | None = None
 
     def __str__(self) -> str:
-        text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
-        if self.flush is not None:
-            text = f"edge {self.flush} on the palm"
+        text = f"edge {self.flush} on the palm"
+        if self.phi is not None:
+            text = f"phi = {math.degrees(self.phi):g} deg"
         return text if self.x is None else f"{text} at x = {self.x:g} m"
 
     def find_angle(self, scene: Scene, near: float) -> float:
         """The angle that the object shall have [rad], of all turns the nearest to one."""
-        if self.flush is None:
-            assert self.phi is not None
+        if self.phi is not None:
             return self.phi
+        assert self.flush is not None
         angle = scene.polygon.flush_angle(self.flush)
         return angle + 2 * math.pi * round((near - angle) / (2 * math.pi))
+
+    def with_edge(self, scene: Scene, most: float) -> Goal:
+        """The goal with the edge that lies on the palm at its angle to within `most` [rad]."""
+        if self.phi is None:
+            return self
+        for edge in range(scene.polygon.n_vertices):
+            if abs(math.remainder(self.phi - scene.polygon.flush_angle(edge), math.tau)) < most:
+                return replace(self, flush=edge)
+        return self
 
 
 @declare(

@@ -27,6 +27,7 @@ from ..common.errors import Change, InfeasibleError, InputError, SolverError
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
+from ..geometry.tracing import HELD
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
@@ -100,7 +101,8 @@ def find_route(
             make_folder(str(cache), "cache")
         key, roadmap = get_roadmap(problem, plan_options, cache)
         before, start, spent = list[Answer](), problem.start, 0.0
-        for index, goal in enumerate(problem.goals):
+        for index, given_goal in enumerate(problem.goals):
+            goal = given_goal.with_edge(problem.scene, HELD)
             place = make_place(problem.scene, start)
             if is_at(place, goal):
                 reason = f"{goal} holds already where the motion starts"

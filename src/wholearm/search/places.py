@@ -87,9 +87,11 @@ def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
     return False
 
 
-def is_flush(scene: Scene, contacts: Sequence[Contact], edge: int) -> bool:
-    """Whether an edge lies on the palm with these contacts."""
-    ends = {edge, (edge + 1) % scene.polygon.n_vertices}
+def lies_as(scene: Scene, contacts: Sequence[Contact], z: Array, goal: Goal) -> bool:
+    """Whether the edge of a goal lies on the palm with these contacts, and at the goal's angle."""
+    if goal.flush is None or (goal.phi is not None and abs(z[2] - goal.phi) >= HELD):
+        return False
+    ends = {goal.flush, (goal.flush + 1) % scene.polygon.n_vertices}
     return ends <= {c.index for c in contacts if c.finger is None}
 
 
@@ -99,7 +101,7 @@ def is_at(place: RoadmapPlace, goal: Goal) -> bool:
     if goal.x is not None and abs(place.z[0] - goal.x) > HELD * scene.scales.length:
         return False
     if goal.flush is not None:
-        return is_flush(scene, place.contacts, goal.flush)
+        return lies_as(scene, place.contacts, place.z, goal)
     assert goal.phi is not None
     return bool(abs(place.z[2] - goal.phi) < HELD)
 
@@ -112,7 +114,7 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
     formation, scene = curve.formation, curve.formation.scene
     until = Until(coordinate="phi", value=goal.phi)
     if goal.flush is not None:
-        if goal.x is None or not is_flush(scene, formation.contacts, goal.flush):
+        if goal.x is None or not lies_as(scene, formation.contacts, curve.start, goal):
             return None
         until = Until(coordinate="x", value=goal.x)
     distance = EndDistance(scene, until, curve.start)

@@ -43,7 +43,7 @@ from .edges import (
     point_out,
     time_parts,
 )
-from .places import RoadmapPlace, close_place, is_flush, list_formations_at, make_place
+from .places import RoadmapPlace, close_place, lies_as, list_formations_at, make_place
 
 T = TypeVar("T")
 
@@ -236,10 +236,10 @@ class Roadmap:
     def _land(self, edge: Edge, goal: Goal) -> Edge | None:
         """The copy of an edge that lands on a goal; None if it is another edge, or too far."""
         *before, last = edge.steps
-        if goal.flush is None or goal.x is None:
+        if goal.x is None:
             return None
         near = abs(edge.stop.z[0] - goal.x) <= NEAR * self.scene.scales.length
-        if not (near and is_flush(self.scene, edge.stop.contacts, goal.flush)):
+        if not (near and lies_as(self.scene, edge.stop.contacts, edge.stop.z, goal)):
             return None
         formation = Formation(self.scene, edge.stop.contacts)
         z = close_contacts(formation, edge.stop.z, np.zeros(0), ((0, goal.x),))
@@ -254,7 +254,7 @@ class Roadmap:
 
         If x is free it is sampled.
         """
-        if goal.phi is None:
+        if goal.phi is None or goal.flush is not None:
             return []
         scene, table, edges = self.scene, contact_table(self.scene), list[Edge]()
         x = place.z[0] + np.linspace(-1.5, 1.5, 13) * scene.scales.length
