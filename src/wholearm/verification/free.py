@@ -387,6 +387,11 @@ class FreeReport(Result):
             f"{position:.1e} m and {angle:.1e} rad of the plan"
         )
 
+    def find_phase(self, time: float) -> int:
+        """Number of the phase of the whole at a time [s]."""
+        begun = (phase.number for phase in self.phases if phase.start <= time)
+        return max(begun, default=1)
+
     @property
     def values(self) -> dict[str, Any]:
         """Everything that JSON has."""
@@ -399,7 +404,7 @@ class FreeReport(Result):
             "phases_alone": self.alone,
             "phases": self.phases,
             "outcome": whole.outcome.text,
-            "events": [{**e._asdict(), "phase": e.phase + 1} for e in whole.events],
+            "events": [{**e._asdict(), "phase": self.find_phase(e.time)} for e in whole.events],
             "contacts": whole.stretches,
             "energy": {**energies, "residual": whole.energies.residual[-1]},
             "residual": whole.residual,
@@ -411,7 +416,9 @@ class FreeReport(Result):
         """The verdict with its reason, then what happened."""
         whole, lines = self.whole, [f"failure: {text}" for text in self.failures[1:]]
         form = fixed(1e-3 * max((s.least for s in whole.stretches if s.least > 0), default=0.0))
-        events = [(e.time, e.phase + 1, e.text.partition(" at t =")[0]) for e in whole.events]
+        events = [
+            (e.time, self.find_phase(e.time), e.text.partition(" at t =")[0]) for e in whole.events
+        ]
         columns = {"contact": "contact", "start": "presses from [s]:.6f", "stop": "to [s]:.6f"}
         columns |= {"least": f"least c_n [N]:{form}", "time": "at [s]:.6f"}
         told = "the whole from the start, by the clock" if self.alone else ""
