@@ -301,7 +301,7 @@ def _list_modes(plan: Plan) -> Table:
         for mode in phase.modes:
             contacts = ", ".join(name + words[how] for name, how in mode.contacts.items())
             text = f"{contacts}; joints turn {' '.join(mode.joints)}"
-            if phase.sequences and mode is phase.modes[-1]:
+            if phase.sequences > 1 and mode is phase.modes[-1]:
                 text += f"; best of {phase.sequences} sequences of modes"
             rows.append((phase.number, mode.start, mode.stop, text))
     heads = ["phase:d", "from [s]:.4f", "to [s]:.4f", "contact modes"]

@@ -203,7 +203,8 @@ def find_hand(
     report: Callable[[str], None],
 ) -> tuple[str, tuple[Change, ...]]:
     """The least change of `list_hands` with which the goal is reached from the same pose."""
-    tried, stop = 0, time.process_time() + max(TIMES * seconds, AT_LEAST)
+    tried, ended = 0, "; the time for such trials is over"
+    stop = time.process_time() + max(TIMES * seconds, AT_LEAST)
     with suppress(OutOfTime):
         for change in list_hands(problem.scene):
             if time.process_time() > stop:
@@ -222,9 +223,11 @@ def find_hand(
             result = _search_changed(changed, z, goal, options, True, most=EAGER.most)
             if result is not None:
                 return _describe_reached(change, result[1]), (change,)
+        else:
+            ended = ""
     most = f"{100 * (max(HANDS) - 1):.0f} %"
-    text = f"the goal is not reached with {tried} other lengths or bases of the fingers"
-    return f"{text}, up to {most} off", ()
+    hands = f"{tried} other hand{'s'[: tried != 1]} (lengths or bases of the fingers"
+    return f"the goal is not reached with {hands}, up to {most} off){ended}", ()
 
 
 def list_hands(scene: Scene) -> list[Change]:

@@ -345,8 +345,8 @@ class Answer(Alternative):
             lines.append(text + ended)
         if self.route.in_cells:
             lines.append("this one leads through cells, where nothing bounds times from below")
-        tried = f"{self.settled} places looked at, {len(self.blocked)} ways blocked"
-        lines.append(f"{tried}, {len(self.failures)} routes without a plan")
+        tried = f"places looked at: {self.settled}, ways blocked: {len(self.blocked)}"
+        lines.append(f"{tried}, routes without a plan: {len(self.failures)}")
         return [*lines, NOT_CONSIDERED]
 
     @property

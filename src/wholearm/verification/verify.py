@@ -578,7 +578,8 @@ def find_wedged(
     if free[0] == 0:
         return 0.0
     before, after = beyond[free[0] - 1], beyond[free[0]]
-    return float((free[0] - after / (after - before)) * (t[1] - t[0]))
+    held = float((free[0] - after / (after - before)) * (t[1] - t[0]))
+    return held if held > SETTLING * scene.scales.time else 0.0
 
 
 _OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
