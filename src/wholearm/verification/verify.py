@@ -810,7 +810,7 @@ def find_resting_changes(
         starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
     changes: list[results.TorqueAdvice] = []
     for free in _TORQUES:
-        if len(free) == 2 and changes:
+        if len(free) == 2 and not all(change.holds for change in changes):
             break
         solutions = ((path, find_least_change(*sides, free)) for path, sides in starts)
         least = [(path, unit * one) for path, one in solutions if one is not None]
@@ -818,7 +818,7 @@ def find_resting_changes(
         held = None if moved else rest.statics.find_holding_change(tau, epsilon, free)
         if moved:
             changes.append(make_advice(min(moved, key=np.linalg.norm), tau))
-        elif held is not None:
+        elif held is not None and (len(free) == 1 or not changes):
             changes.append(make_advice(held, tau, holds=True))
     return tuple(sorted(changes, key=lambda change: (change.holds, np.hypot(*change.change))))
 
