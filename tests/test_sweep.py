@@ -195,8 +195,7 @@ def test_figures(box: Problem) -> None:
     mass, hold = np.linspace(0.1, 0.3, 5), ["constant", "linear"]
     curve = wholearm.draw_sweep(make({"mass": mass}, box)).axes
     assert len(curve) == 1 and curve[0].get_ylabel() == "time [s]"
-    (line,) = curve[0].get_lines()
-    y = np.asarray(line.get_ydata())
+    y = np.asarray(*(line.get_ydata() for line in curve[0].get_lines()))
     assert y[:4] == pytest.approx([1.0, 1.1, 1.2, 1.3]) and np.isnan(y[4])
     assert [text.get_text() for text in curve[0].texts] == ["too heavy"]
     words = make({"mass": mass, "control_hold": hold, "fingers_collide": [False]}, box)
@@ -204,8 +203,9 @@ def test_figures(box: Problem) -> None:
     lines = wholearm.draw_sweep(words).axes[0]
     legend = lines.get_legend()
     assert legend is not None
-    names = [text.get_text() for text in legend.get_texts()]
-    assert names == ["control_hold = constant", "control_hold = linear"]
+    assert [text.get_text() for text in legend.get_texts()] == [f"control_hold = {k}" for k in hold]
+    # Reasons have other colours than the two curves.
+    assert {k.get_color() for k in lines.get_lines() if k.get_marker() == "x"} == {"#009E73"}
     twice = make({"mass": mass}, [box, box.with_(epsilon=0.1)])
     assert twice.problems == (f"{box.source} (1)", f"{box.source} (2)")
     assert len(wholearm.draw_sweep(twice).axes[0].get_legend_handles_labels()[1]) == 2

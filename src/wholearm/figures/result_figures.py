@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import groupby
+from itertools import cycle, groupby
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..common.arrays import Array
@@ -37,6 +39,10 @@ if TYPE_CHECKING:
 
 MOST = 24  # panels, and lines of a panel
 SHARE = 0.08  # of the points of a panel, from which their reason is written there
+LEVELS = 8  # of contour lines at most, which are the ticks of the colour bar
+# White with a dark edge, to be seen on any colour.
+CONTOUR: Any = {"color": "white", "linewidth": 0.9}
+CONTOUR["path_effects"] = [withStroke(linewidth=1.9, foreground=style.INK)]
 Row = dict[str, Any]  # of a sweep
 Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
 _DOT = "  \u00b7  "  # between the parts of a title
@@ -260,7 +266,10 @@ def draw_sweep(sweep: Sweep) -> Figure:
     contours = len(shown) == 2 and not sweep.samples
     panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
     reasons = sweep.reasons
-    colours = {reason: style.PALETTE[k % len(style.PALETTE)] for k, reason in enumerate(reasons)}
+    crosses = not contours and (len(lines) > 1 or sweep.samples > 0)
+    # Crosses have other colours than the curves beside them.
+    palette = np.roll(style.PALETTE, -len(lines) * crosses).tolist()
+    colours = dict(zip(reasons, cycle(palette), strict=False))
     columns = 2 if len(panels) == 4 else min(3, len(panels))
     height = 1.2 + 3.0 * math.ceil(len(panels) / columns) + 0.17 * min(len(reasons), 8)
     with style.open_figure(10.0 if columns > 1 else 7.0, height, layout="constrained") as figure:
@@ -275,14 +284,17 @@ def draw_sweep(sweep: Sweep) -> Figure:
         for axes in grid.flat[len(panels) :]:
             axes.remove()
         if contours:
-            figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), label=sweep.label)
-        patches = [
-            Patch(color=_pale(colours[reason]), label=fill(f"{reason}: {count}", 110))
-            for reason, count in [*reasons.items()][:8]
-        ]
-        if patches:
-            look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
-            figure.legend(handles=patches, title="points without a plan, by reason", **look)
+            look: Any = {"label": sweep.label, "ticks": MaxNLocator(LEVELS)}
+            bar = figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), **look)
+            bar.ax.grid(axis="y", **CONTOUR)
+        keys = list[Line2D]()
+        for reason, count in [*reasons.items()][:8]:
+            colour: Any = colours[reason] if crosses else _pale(colours[reason])
+            look = {"color": colour, "label": fill(f"{reason}: {count}", 110)}
+            keys.append(Line2D([], [], linestyle="", marker="x" if crosses else "s", **look))
+        if keys:
+            look = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
+            figure.legend(handles=keys, title="points without a plan, by reason", **look)
         figure.suptitle(", ".join(sweep.problems), fontsize=10, parse_math=False)
     return figure
 
@@ -316,20 +328,21 @@ def _draw_lines(
     """Values over one parameter.
 
     Where a curve alone has no value, there is a band in the colour of the reason. Several lines,
-    and samples, have a row of crosses each at the bottom.
+    and samples, have a row of crosses each, in a band below all values.
     """
     axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
     axes.grid(color=style.GRID, linewidth=0.4)
     single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
+    tall = min(0.05, 0.4 / len(lines))  # height of a row of crosses, over that of the axes
     for number, (label, rows) in enumerate(lines.items()):
         rows = sorted(rows, key=lambda row: row[name])
         x = np.array([row[name] for row in rows], dtype=float)
         (values, reasons), (dash, marker) = _take(rows), style.LINES[number % len(style.LINES)]
         look: Any = {"color": style.PALETTE[number % len(style.PALETTE)], "marker": marker, "ms": 3}
         axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
-        strip, borders, first = 0.05 * number + 0.025, _border(x), 0
+        strip, borders, first = tall * (number + 0.5), _border(x), 0
         if len(lines) > 1 and any(reasons):
-            axes.plot(0.0, strip, transform=axes.transAxes, clip_on=False, **look)
+            axes.plot(-0.02, strip, transform=axes.transAxes, clip_on=False, **look)
         for reason, group in groupby(reasons):
             last = first + len(list(group))
             left, right, colour = borders[first], borders[last], colours.get(reason, "")
@@ -341,9 +354,12 @@ def _draw_lines(
                 places = np.full(last - first, strip)
                 axes.plot(x[first:last], places, "x", color=colour, transform=across)
             first = last
-    if not single:
+    if not single and sweep.reasons:
         bottom, top = axes.get_ylim()
-        axes.set_ylim(top - (top - bottom) / (1 - 0.05 * len(lines)), top)
+        axes.set_yticks([y for y in axes.get_yticks() if bottom <= y <= top])
+        low = top - (top - bottom) / (1 - tall * len(lines))
+        axes.set_ylim(low, top)
+        axes.axhspan(low, bottom, color=style.BAND, linewidth=0, zorder=1)
     if len(lines) > 1:
         axes.legend(fontsize=8)
 
@@ -360,10 +376,8 @@ def _draw_plane(
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
     mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
-        levels = MaxNLocator(8).tick_values(low, high)
-        shown_values = np.ma.masked_invalid(values)
-        lines = axes.contour(x, y, shown_values, levels, colors="white", linewidths=0.9)
-        axes.clabel(lines, fontsize=7.5)
+        levels, known = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
+        axes.contour(x, y, known, levels).set(**CONTOUR)
     shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():
         here = names == reason
