@@ -195,7 +195,8 @@ def test_figures(box: Problem) -> None:
     mass, hold = np.linspace(0.1, 0.3, 5), ["constant", "linear"]
     curve = wholearm.draw_sweep(make({"mass": mass}, box)).axes
     assert len(curve) == 1 and curve[0].get_ylabel() == "time [s]"
-    y = np.asarray(*(line.get_ydata() for line in curve[0].get_lines()))
+    (line,) = curve[0].get_lines()
+    y = np.asarray(line.get_ydata())
     assert y[:4] == pytest.approx([1.0, 1.1, 1.2, 1.3]) and np.isnan(y[4])
     assert [text.get_text() for text in curve[0].texts] == ["too heavy"]
     words = make({"mass": mass, "control_hold": hold, "fingers_collide": [False]}, box)

@@ -47,8 +47,8 @@ Row = dict[str, Any]  # of a sweep
 Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
-    ("contacts kept too", style.PALETTE[2], "o"),
-    ("goal reached", style.PALETTE[0], "s"),
+    ("goal reached, contacts kept", style.PALETTE[2], "o"),
+    ("goal reached, a contact lost", style.PALETTE[0], "s"),
     ("goal missed", style.PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
@@ -211,7 +211,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     kinds = np.array([find_kind(record) for record in records])
     for kind, (label, colour, marker) in enumerate(_KINDS):
         points = places[kinds == kind]
-        text = f"{label}: {len(points)}"
+        text = f"{label}: {len(points)} of {len(study.records)}"
         axes.plot(*points.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     axes.set(xscale="log", yscale="log")
     around = np.vstack([places, goal])
@@ -224,7 +224,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8)
     beyond = len(study.records) - len(records)
     title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
     axes.set_title(title, fontsize=9)
@@ -424,21 +424,27 @@ def draw_search(result: Design) -> Figure:
         first = style.inset(figure, 1.2, tall - 2.4, wide, 2.0)
         others = [style.inset(figure, 1.2, tall - 3.4 - k, wide, 0.8) for k in range(len(choices))]
         starts = sorted({hand.start for hand in result.hands})
+        # Some far worse hands are on the upper edge.
+        good = [hand.cost for hand in result.hands if not hand.reason]
+        low, high = np.quantile(good, [0.0, 0.95], method="higher")
+        low, high = low - 0.1 * (high - low) - 1e-9, high + 0.05 * (high - low)
         for start, colour in zip(starts, style.PALETTE * len(starts), strict=False):
             hands = [hand for hand in result.hands if hand.start == start]
             costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
             best, none = np.fmin.accumulate(costs), number[np.isnan(costs)]
-            leads, values = costs <= best, np.array([result.aim.find(hand) for hand in hands])
-            first.step(number, best, where="post", color=colour, label=f"start {start}")
-            for axes, column in zip([first, *others], [costs, *values.T], strict=True):
-                shown = ~np.isnan(costs)
-                axes.plot(number[shown], column[shown], ".", color=colour, alpha=0.4)
-                axes.step(number[leads], column[leads], where="post", color=colour)
+            # The best hand so far, from the first one with a plan on.
+            shown, leads = ~np.isnan(best), np.where(costs <= best, number - 1, 0)
+            leader = np.maximum.accumulate(leads)[shown]
+            values = np.array([result.aim.find(hand) for hand in hands])
+            values[none - 1] = np.nan
+            look: Any = {"where": "post", "color": colour, "label": f"start {start}"}
+            columns = [np.minimum(costs, high), *values.T]
+            for axes, column in zip([first, *others], columns, strict=True):
+                axes.plot(number, column, ".", color=colour, alpha=0.4, clip_on=False)
+                axes.step(number[shown], column[leader], **look)
             across = first.get_xaxis_transform()
             first.plot(none, 0 * none + 0.03, "x", color=colour, transform=across)
-        good = [hand.cost for hand in result.hands if not hand.reason]
-        first.set_ylim(min(good) - 0.1 * np.ptp(good) - 1e-9, np.quantile(good, 0.95))
-        first.set_ylabel(result.label)
+        first.set(ylim=(low, high), ylabel=result.label)
         first.legend(bbox_to_anchor=(1.01, 1.0), loc="upper left")
         for axes, choice in zip(others, choices, strict=True):
             room = 0.05 * (choice.high - choice.low)
@@ -448,6 +454,7 @@ def draw_search(result: Design) -> Figure:
         for axes in (first, *others):
             axes.sharex(others[-1])
             axes.tick_params(labelbottom=axes is others[-1])
-        others[-1].set_xlabel("hands tried; x: no plan")
-        style.write_title(figure, ", ".join(plan.headline for plan in result.plans))
+        others[-1].set_xlabel("hands tried; x: no plan; on the upper edge: more")
+        ends = [f"{p.problem.name}{_DOT}{p.value:.6g} {p.unit}" for p in result.plans]
+        style.write_title(figure, ", ".join(ends))
         return figure
