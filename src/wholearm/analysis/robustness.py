@@ -243,8 +243,7 @@ class Trial:
         near = near and angle <= self.uncertainty.angle
         given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
         # Straight lines through the steps of the simulation would be seen.
-        steps = np.diff(simulation.z[:, :2], axis=0)
-        way = np.append(0.0, np.cumsum(np.hypot(*steps.T)))
+        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(simulation.z[:, :2], axis=0).T)))
         even = np.interp(np.linspace(0.0, way[-1], 101), way, t)
         even = even[even > 0]
         left = np.searchsorted(t, even) - 1

@@ -485,8 +485,7 @@ def force_margins(
     size_of_title, between = (8.5, " \u00b7 ") if slim else (10.5, "  \u00b7  ")
     whole = between.join(part.replace(" ", "\u00a0") for part in parts if part)
     longest = max(24, int(11.5 * width * 10.5 / size_of_title))
-    outcome = str(meta.get("outcome", ""))  # of a replay
-    title = textwrap.wrap(whole, longest) + textwrap.wrap(outcome, longest)
+    title = textwrap.wrap(whole, longest) + textwrap.wrap(str(meta.get("outcome", "")), longest)
     left, gap = 0.8, 0.22
     top = foot + sum(sizes) + gap * (len(sizes) - 1) + 0.3 + strip.height
     with style.open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:

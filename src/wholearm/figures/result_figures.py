@@ -289,9 +289,9 @@ def draw_sweep(sweep: Sweep) -> Figure:
             bar.ax.grid(axis="y", **CONTOUR)
         keys = list[Line2D]()
         for reason, count in [*reasons.items()][:8]:
-            colour: Any = colours[reason] if crosses else _pale(colours[reason])
-            look = {"color": colour, "label": fill(f"{reason}: {count}", 110)}
-            keys.append(Line2D([], [], linestyle="", marker="x" if crosses else "s", **look))
+            look = {"color": colours[reason] if crosses else _pale(colours[reason])}
+            look |= {"marker": "sx"[crosses], "label": fill(f"{reason}: {count}", 110)}
+            keys.append(Line2D([], [], linestyle="", **look))
         if keys:
             look = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
             figure.legend(handles=keys, title="points without a plan, by reason", **look)
@@ -356,9 +356,8 @@ def _draw_lines(
             first = last
     if not single and sweep.reasons:
         bottom, top = axes.get_ylim()
-        axes.set_yticks([y for y in axes.get_yticks() if bottom <= y <= top])
         low = top - (top - bottom) / (1 - tall * len(lines))
-        axes.set_ylim(low, top)
+        axes.set(yticks=[y for y in axes.get_yticks() if bottom <= y <= top], ylim=(low, top))
         axes.axhspan(low, bottom, color=style.BAND, linewidth=0, zorder=1)
     if len(lines) > 1:
         axes.legend(fontsize=8)
@@ -432,16 +431,13 @@ def draw_search(result: Design) -> Figure:
             hands = [hand for hand in result.hands if hand.start == start]
             costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
             best, none = np.fmin.accumulate(costs), number[np.isnan(costs)]
-            # The best hand so far, from the first one with a plan on.
-            shown, leads = ~np.isnan(best), np.where(costs <= best, number - 1, 0)
-            leader = np.maximum.accumulate(leads)[shown]
-            values = np.array([result.aim.find(hand) for hand in hands])
-            values[none - 1] = np.nan
-            look: Any = {"where": "post", "color": colour, "label": f"start {start}"}
-            columns = [np.minimum(costs, high), *values.T]
+            # The best hand so far. All is NaN of hands without a plan.
+            leader = np.maximum.accumulate(np.where(costs <= best, number - 1, 0))
+            values = np.array([result.aim.find(hand) for hand in hands]).T + 0 * costs
+            columns, label = [np.minimum(costs, high), *values], f"start {start}"
             for axes, column in zip([first, *others], columns, strict=True):
                 axes.plot(number, column, ".", color=colour, alpha=0.4, clip_on=False)
-                axes.step(number[shown], column[leader], **look)
+                axes.step(number, column[leader], color=colour, where="post", label=label)
             across = first.get_xaxis_transform()
             first.plot(none, 0 * none + 0.03, "x", color=colour, transform=across)
         first.set(ylim=(low, high), ylabel=result.label)

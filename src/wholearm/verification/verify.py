@@ -185,8 +185,7 @@ def judge(
         _report_phase(simulation, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
-    scene = problem.scene
-    gap = find_finger_gap(scene, simulation) if scene.fingers_collide else None
+    gap = find_finger_gap(problem.scene, simulation) if problem.scene.fingers_collide else None
     reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += describe_failures(simulation, phases, gap if reached else None, allowance)
