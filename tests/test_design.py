@@ -7,6 +7,7 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import wholearm
@@ -14,6 +15,7 @@ from wholearm import InfeasibleError, InputError, PlanOptions, Problem, find_sen
 from wholearm.cli.command import main
 from wholearm.design.hand import Design, Hand, design_hand, read_choices
 from wholearm.design.sweep import find_parameter, list_parameters, require_allowed
+from wholearm.figures.result_figures import draw_search
 
 UNITS = {
     "": (0, 0, 0), "kg": (0, 1, 0), "m": (1, 0, 0), "N": (1, 1, -2), "N m": (2, 1, -2),
@@ -105,6 +107,10 @@ def test_design_finds_the_strongest_hand(designed: Design, box: Problem) -> None
     assert designed.plans[0].value < designed.aim.today[0]
     assert designed.plans[0].value == pytest.approx(designed.optima[0].cost, rel=1e-9)
     assert designed.plans[0].replay is not None
+    # Lines for the best hand go on to the last one.
+    lines = [line for axes in draw_search(designed).axes for line in axes.lines]
+    ends = [np.max(line.get_xdata()) for line in lines if line.get_label() == "start 1"]
+    assert ends == 3 * [sum(hand.start == 1 for hand in designed.hands)]
 
 
 def test_hands_without_a_plan_are_counted(box: Problem) -> None:
@@ -126,17 +132,8 @@ def test_commands(box_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "today" in capsys.readouterr().out and Path(figure).stat().st_size > 1000
     assert wholearm.solve(wholearm.load(out)).duration > 0
     bars = str(tmp_path / "bars.png")
-    command = [
-        "sensitivities",
-        str(box_file),
-        "--of",
-        "mass",
-        "torque_limit1",
-        "-o",
-        bars,
-        "--json",
-    ]
-    assert main([*command, "--jobs", "1"]) == 0
+    command = ["sensitivities", str(box_file), "--of", "mass", "torque_limit1", "-o", bars]
+    assert main([*command, "--json", "--jobs", "1"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {row["name"] for row in rows} == {"mass", "torque_limit1"}
     assert Path(bars).stat().st_size > 1000

@@ -540,8 +540,7 @@ def test_a_replay_is_a_trajectory_and_survives_its_file(
         assert found.at(found.t[near]).z[0] == pytest.approx(found.z[near], abs=1e-12)
     times = np.linspace(0.01, 1.95, 41)
     replay = simulate(simulation.problem, torque, times=times)
-    exact = [replay.at(t)[:5] for t in times]
-    np.testing.assert_allclose(found.at(times).z, exact, rtol=0, atol=1e-8)
+    assert found.at(times).z == pytest.approx(np.array([*map(replay.at, times)])[:, :5], abs=1e-8)
     save(simulation, tmp_path / "a.npz")
     loaded = load_trajectory(tmp_path / "a.npz")
     for name in ("t", "tau", "c_n", "phase", "z", "z_ddot"):
@@ -556,11 +555,12 @@ def test_a_replay_that_fails_is_drawn_and_saved(tmp_path: Path) -> None:
     """It loses a contact on its way; another never moves, so that no force is known."""
     problem, trajectory = plan()
     weak = TorqueProfile(trajectory.torque.breaks, trajectory.torque.coefficients * 0.9)
-    for torque in (weak, constant((0.3, -0.8), 0.1)):
-        report = verify(problem, torque)
-        assert not report.ok
+    for report in (verify(problem, weak), verify(problem, constant((0.3, -0.8), 0.1))):
+        assert not report.ok and report.finger_gap is not None
         figure = plots.force_margins(report)
-        assert any("replayed" in text.get_text() for text in figure.texts)
+        title = " ".join(figure.texts[-1].get_text().split())
+        assert f"{1e3 * report.finger_gap.least:.3g} mm {report.outcome}" in title
+        assert "replayed" in title
         report.trajectory.save(tmp_path / "a.npz")
         figure = plots.force_margins(load_trajectory(tmp_path / "a.npz"))
     plots.save(figure, tmp_path / "a.png")

@@ -92,6 +92,8 @@ def test_nothing_off_is_the_plan(trial: Trial) -> None:
     assert record["reached"] and record["kept"] and not record["lost"]
     assert record["distance"] < 1e-8 and record["angle"] < 1e-8
     assert record["least"] == pytest.approx(0.3, abs=1e-5)
+    way = np.hypot(*np.diff(np.array(record["path"])[:, :2], axis=0).T)
+    assert len(way) == 100 and way.max() < 2 * way.mean()
 
 
 def test_a_start_that_is_off_closes_the_fingers_there(trial: Trial) -> None:
@@ -179,7 +181,7 @@ def follow(stretches: list[tuple[str, float, float]], phases: tuple[Any, ...]) -
     events *= ("c", 0.46, 1) in stretches
     simulation: Any = SimpleNamespace(
         t=t,
-        z=np.zeros((11, 5)),
+        **dict.fromkeys(("z", "z_dot", "z_ddot"), np.zeros((11, 5))),
         c_n=np.ones((11, len(names))),
         contacts=names,
         stretches=[FreeStretch(*stretch, least=1.0, time=0.0) for stretch in stretches],

@@ -204,8 +204,9 @@ def test_figures(box: Problem) -> None:
     lines = wholearm.draw_sweep(words).axes[0]
     legend = lines.get_legend()
     assert legend is not None
-    names = [text.get_text() for text in legend.get_texts()]
-    assert names == ["control_hold = constant", "control_hold = linear"]
+    assert [text.get_text() for text in legend.get_texts()] == [f"control_hold = {k}" for k in hold]
+    # Reasons have other colours than the two curves.
+    assert {k.get_color() for k in lines.get_lines() if k.get_marker() == "x"} == {"#009E73"}
     twice = make({"mass": mass}, [box, box.with_(epsilon=0.1)])
     assert twice.problems == (f"{box.source} (1)", f"{box.source} (2)")
     assert len(wholearm.draw_sweep(twice).axes[0].get_legend_handles_labels()[1]) == 2

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..common.arrays import Array, interpolate
+from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.fields import Field, Range
@@ -29,7 +29,7 @@ from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import PARAMETERS, Phase, Problem, change_scene, read_widths
 from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory
+from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation.events import OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free
@@ -153,8 +153,8 @@ class Trial:
 
         These are `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
         contact that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n [N]
-        of planned contacts; `path`, poses at even times, of the first 200, as many as figures need;
-        `ended`, empty or why the simulation ended early or could not begin.
+        of planned contacts; `path`, poses at even distances, of the first 200, as many as figures
+        need; `ended`, empty or why the simulation ended early or could not begin.
         """
         number, (*sample, offset) = task
         names = [parameter.name for parameter in self.uncertainty.varied]
@@ -242,8 +242,13 @@ class Trial:
         near = distance <= self.uncertainty.find_distance(self.problem.scene)
         near = near and angle <= self.uncertainty.angle
         given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
-        even = np.linspace(0.0, t[-1], 24)
-        path = interpolate(even, t, simulation.z)
+        # Straight lines through the steps of the simulation would be seen.
+        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(simulation.z[:, :2], axis=0).T)))
+        even = np.interp(np.linspace(0.0, way[-1], 101), way, t)
+        even = even[even > 0]
+        left = np.searchsorted(t, even) - 1
+        knots = simulation.z, simulation.z_dot, simulation.z_ddot
+        path = interpolate_quintic(t[left + 1] - t[left], even - t[left], knots, left)[0]
         return {
             "distance": distance,
             "angle": angle,
@@ -253,7 +258,7 @@ class Trial:
             "phase": number,
             "time": time,
             "least": least,
-            "path": path.tolist(),
+            "path": [*simulation.z[:1].tolist(), *path.tolist()],
             "ended": simulation.outcome.text if given_up else "",
         }
 

@@ -608,7 +608,9 @@ def _plot(options: argparse.Namespace) -> int:
         if options.problem is None:
             raise InputError(options.trajectory, "--problem", "is needed to replay torques")
         problem = wholearm.load(options.problem)
-        trajectory = wholearm.simulate(problem, torques, progress=show_progress).trajectory
+        # Steps alone are too far apart for smooth curves; a figure is some 1000 points wide.
+        how: Any = {"times": [k / 1000 * torques.breaks[-1] for k in range(1001)], "minima": True}
+        trajectory = wholearm.simulate(problem, torques, **how, progress=show_progress).trajectory
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
         figure = wholearm.plots.force_margins(

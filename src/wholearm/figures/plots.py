@@ -29,7 +29,6 @@ from ..common.document import fixed
 from ..common.errors import InputError, require_number
 from ..common.files import require_ending, write_whole
 from ..common.sharing import exclusive
-from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import parse_contact
 from ..problem.read import read_own_problem
 from ..results.adopt import Torques, narrow
@@ -37,6 +36,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from ..verification.newton_euler import locate, place_object
+from ..verification.verify import find_finger_gap
 from . import style
 from .style import Styles
 
@@ -265,12 +265,13 @@ def draw_margins(
 ) -> None:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
-    Lines are labelled with the names of contacts and broken where forces step. The scale covers
-    `more` margins [N], of any shape, too.
+    Lines are labelled with the names of contacts and broken where forces step. Contacts that never
+    press have none. The scale covers `more` margins [N], of any shape, too.
     """
     steps, margins = trajectory.find_steps(), trajectory.c_n - epsilon
     t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
-    for index, name in enumerate(trajectory.contacts):
+    for index in np.flatnonzero(np.isfinite(margins).any(axis=0)):
+        name = trajectory.contacts[index]
         # Where margins coincide the earlier, wider line stays visible beside the later one.
         rank = index / max(1, len(trajectory.contacts) - 1)
         colour, line, _ = styles[name]
@@ -470,7 +471,7 @@ def force_margins(
     parts.append(f"objective {objective}" if objective else str(meta.get("status", "")))
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
     if scene.fingers_collide:
-        least = float(evaluate_finger_gap(scene, trajectory.z).min())
+        least = find_finger_gap(scene, trajectory).least
         text = f"{1e3 * least:.3g} mm" if least < 0.9995 else f"{least:.3g} m"
         parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
     # From the foot of the figure to its title, in inches. A slim one has its legend at the foot.
@@ -483,7 +484,8 @@ def force_margins(
     sizes = [1.2 * share] * 3 * motion + [1.75 * share] + [0.85] * rolls + [3.6 * share]
     size_of_title, between = (8.5, " \u00b7 ") if slim else (10.5, "  \u00b7  ")
     whole = between.join(part.replace(" ", "\u00a0") for part in parts if part)
-    title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / size_of_title)))
+    longest = max(24, int(11.5 * width * 10.5 / size_of_title))
+    title = textwrap.wrap(whole, longest) + textwrap.wrap(str(meta.get("outcome", "")), longest)
     left, gap = 0.8, 0.22
     top = foot + sum(sizes) + gap * (len(sizes) - 1) + 0.3 + strip.height
     with style.open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:

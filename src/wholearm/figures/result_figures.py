@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import groupby
+from itertools import cycle, groupby
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..common.arrays import Array
@@ -37,12 +39,16 @@ if TYPE_CHECKING:
 
 MOST = 24  # panels, and lines of a panel
 SHARE = 0.08  # of the points of a panel, from which their reason is written there
+LEVELS = 8  # of contour lines at most, which are the ticks of the colour bar
+# White with a dark edge, to be seen on any colour.
+CONTOUR: Any = {"color": "white", "linewidth": 0.9}
+CONTOUR["path_effects"] = [withStroke(linewidth=1.9, foreground=style.INK)]
 Row = dict[str, Any]  # of a sweep
 Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
-    ("contacts kept too", style.PALETTE[2], "o"),
-    ("goal reached", style.PALETTE[0], "s"),
+    ("goal reached, contacts kept", style.PALETTE[2], "o"),
+    ("goal reached, a contact lost", style.PALETTE[0], "s"),
     ("goal missed", style.PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
@@ -205,7 +211,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     kinds = np.array([find_kind(record) for record in records])
     for kind, (label, colour, marker) in enumerate(_KINDS):
         points = places[kinds == kind]
-        text = f"{label}: {len(points)}"
+        text = f"{label}: {len(points)} of {len(study.records)}"
         axes.plot(*points.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     axes.set(xscale="log", yscale="log")
     around = np.vstack([places, goal])
@@ -218,7 +224,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8)
     beyond = len(study.records) - len(records)
     title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
     axes.set_title(title, fontsize=9)
@@ -260,7 +266,10 @@ def draw_sweep(sweep: Sweep) -> Figure:
     contours = len(shown) == 2 and not sweep.samples
     panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
     reasons = sweep.reasons
-    colours = {reason: style.PALETTE[k % len(style.PALETTE)] for k, reason in enumerate(reasons)}
+    crosses = not contours and (len(lines) > 1 or sweep.samples > 0)
+    # Crosses have other colours than the curves beside them.
+    palette = np.roll(style.PALETTE, -len(lines) * crosses).tolist()
+    colours = dict(zip(reasons, cycle(palette), strict=False))
     columns = 2 if len(panels) == 4 else min(3, len(panels))
     height = 1.2 + 3.0 * math.ceil(len(panels) / columns) + 0.17 * min(len(reasons), 8)
     with style.open_figure(10.0 if columns > 1 else 7.0, height, layout="constrained") as figure:
@@ -275,14 +284,17 @@ def draw_sweep(sweep: Sweep) -> Figure:
         for axes in grid.flat[len(panels) :]:
             axes.remove()
         if contours:
-            figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), label=sweep.label)
-        patches = [
-            Patch(color=_pale(colours[reason]), label=fill(f"{reason}: {count}", 110))
-            for reason, count in [*reasons.items()][:8]
-        ]
-        if patches:
-            look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
-            figure.legend(handles=patches, title="points without a plan, by reason", **look)
+            look: Any = {"label": sweep.label, "ticks": MaxNLocator(LEVELS)}
+            bar = figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), **look)
+            bar.ax.grid(axis="y", **CONTOUR)
+        keys = list[Line2D]()
+        for reason, count in [*reasons.items()][:8]:
+            look = {"color": colours[reason] if crosses else _pale(colours[reason])}
+            look |= {"marker": "sx"[crosses], "label": fill(f"{reason}: {count}", 110)}
+            keys.append(Line2D([], [], linestyle="", **look))
+        if keys:
+            look = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
+            figure.legend(handles=keys, title="points without a plan, by reason", **look)
         figure.suptitle(", ".join(sweep.problems), fontsize=10, parse_math=False)
     return figure
 
@@ -316,20 +328,21 @@ def _draw_lines(
     """Values over one parameter.
 
     Where a curve alone has no value, there is a band in the colour of the reason. Several lines,
-    and samples, have a row of crosses each at the bottom.
+    and samples, have a row of crosses each, in a band below all values.
     """
     axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
     axes.grid(color=style.GRID, linewidth=0.4)
     single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
+    tall = min(0.05, 0.4 / len(lines))  # height of a row of crosses, over that of the axes
     for number, (label, rows) in enumerate(lines.items()):
         rows = sorted(rows, key=lambda row: row[name])
         x = np.array([row[name] for row in rows], dtype=float)
         (values, reasons), (dash, marker) = _take(rows), style.LINES[number % len(style.LINES)]
         look: Any = {"color": style.PALETTE[number % len(style.PALETTE)], "marker": marker, "ms": 3}
         axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
-        strip, borders, first = 0.05 * number + 0.025, _border(x), 0
+        strip, borders, first = tall * (number + 0.5), _border(x), 0
         if len(lines) > 1 and any(reasons):
-            axes.plot(0.0, strip, transform=axes.transAxes, clip_on=False, **look)
+            axes.plot(-0.02, strip, transform=axes.transAxes, clip_on=False, **look)
         for reason, group in groupby(reasons):
             last = first + len(list(group))
             left, right, colour = borders[first], borders[last], colours.get(reason, "")
@@ -341,9 +354,11 @@ def _draw_lines(
                 places = np.full(last - first, strip)
                 axes.plot(x[first:last], places, "x", color=colour, transform=across)
             first = last
-    if not single:
+    if not single and sweep.reasons:
         bottom, top = axes.get_ylim()
-        axes.set_ylim(top - (top - bottom) / (1 - 0.05 * len(lines)), top)
+        low = top - (top - bottom) / (1 - tall * len(lines))
+        axes.set(yticks=[y for y in axes.get_yticks() if bottom <= y <= top], ylim=(low, top))
+        axes.axhspan(low, bottom, color=style.BAND, linewidth=0, zorder=1)
     if len(lines) > 1:
         axes.legend(fontsize=8)
 
@@ -360,10 +375,8 @@ def _draw_plane(
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
     mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
-        levels = MaxNLocator(8).tick_values(low, high)
-        shown_values = np.ma.masked_invalid(values)
-        lines = axes.contour(x, y, shown_values, levels, colors="white", linewidths=0.9)
-        axes.clabel(lines, fontsize=7.5)
+        levels, known = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
+        axes.contour(x, y, known, levels).set(**CONTOUR)
     shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():
         here = names == reason
@@ -410,21 +423,24 @@ def draw_search(result: Design) -> Figure:
         first = style.inset(figure, 1.2, tall - 2.4, wide, 2.0)
         others = [style.inset(figure, 1.2, tall - 3.4 - k, wide, 0.8) for k in range(len(choices))]
         starts = sorted({hand.start for hand in result.hands})
+        # Some far worse hands are on the upper edge.
+        good = [hand.cost for hand in result.hands if not hand.reason]
+        low, high = np.quantile(good, [0.0, 0.95], method="higher")
+        low, high = low - 0.1 * (high - low) - 1e-9, high + 0.05 * (high - low)
         for start, colour in zip(starts, style.PALETTE * len(starts), strict=False):
             hands = [hand for hand in result.hands if hand.start == start]
             costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
             best, none = np.fmin.accumulate(costs), number[np.isnan(costs)]
-            leads, values = costs <= best, np.array([result.aim.find(hand) for hand in hands])
-            first.step(number, best, where="post", color=colour, label=f"start {start}")
-            for axes, column in zip([first, *others], [costs, *values.T], strict=True):
-                shown = ~np.isnan(costs)
-                axes.plot(number[shown], column[shown], ".", color=colour, alpha=0.4)
-                axes.step(number[leads], column[leads], where="post", color=colour)
+            # The best hand so far. All is NaN of hands without a plan.
+            leader = np.maximum.accumulate(np.where(costs <= best, number - 1, 0))
+            values = np.array([result.aim.find(hand) for hand in hands]).T + 0 * costs
+            columns, label = [np.minimum(costs, high), *values], f"start {start}"
+            for axes, column in zip([first, *others], columns, strict=True):
+                axes.plot(number, column, ".", color=colour, alpha=0.4, clip_on=False)
+                axes.step(number, column[leader], color=colour, where="post", label=label)
             across = first.get_xaxis_transform()
             first.plot(none, 0 * none + 0.03, "x", color=colour, transform=across)
-        good = [hand.cost for hand in result.hands if not hand.reason]
-        first.set_ylim(min(good) - 0.1 * np.ptp(good) - 1e-9, np.quantile(good, 0.95))
-        first.set_ylabel(result.label)
+        first.set(ylim=(low, high), ylabel=result.label)
         first.legend(bbox_to_anchor=(1.01, 1.0), loc="upper left")
         for axes, choice in zip(others, choices, strict=True):
             room = 0.05 * (choice.high - choice.low)
@@ -434,6 +450,7 @@ def draw_search(result: Design) -> Figure:
         for axes in (first, *others):
             axes.sharex(others[-1])
             axes.tick_params(labelbottom=axes is others[-1])
-        others[-1].set_xlabel("hands tried; x: no plan")
-        style.write_title(figure, ", ".join(plan.headline for plan in result.plans))
+        others[-1].set_xlabel("hands tried; x: no plan; on the upper edge: more")
+        ends = [f"{p.problem.name}{_DOT}{p.value:.6g} {p.unit}" for p in result.plans]
+        style.write_title(figure, ", ".join(ends))
         return figure

@@ -91,10 +91,11 @@ def unit_of(axes: Axes) -> str:
 
 def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
     """Write the legend of axes to their right, in so small letters that `room` [points] do."""
-    count = len(axes.get_legend_handles_labels()[1])
-    size = min(largest, room / (1.1 * max(count, 1)))
+    keys = axes.get_legend_handles_labels()
+    count = max(len(keys[1]), 1)
+    size = min(largest, room / (1.1 * count))
     look: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.02), "fontsize": size}
-    axes.legend(**look, labelspacing=min(0.5, max(room / (size * max(count, 1)) - 1.0, 0.05)))
+    axes.legend(*keys, **look, labelspacing=min(0.5, max(room / (size * count) - 1.0, 0.05)))
 
 
 def write_title(figure: Figure, text: str, size: float = 10.5, left: float = 0.2) -> None:

@@ -174,8 +174,8 @@ class Trajectory(Drawn):
         single = np.setdiff1d(breaks[stepping & inner], t[repeated])
         steps = np.searchsorted(t, single, side="right")
         phases = np.append(np.flatnonzero(np.diff(self.phase)) + 1, repeated)
-        # The friction of a contact that rolls passes zero without a step.
-        slid = np.where(self.rolling, 0.0, self.c_t)
+        # Friction passes zero without a step where a contact rolls, and together with c_n.
+        slid = np.where(self.rolling, 0.0, self.c_t * self.c_n)
         turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
         every = sort_unique(np.concatenate([steps, phases, turns]))
         # Torques may go on after a motion that has failed.

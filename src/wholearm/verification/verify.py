@@ -154,13 +154,13 @@ def observe(
     return simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
 
 
-def find_finger_gap(simulation: Simulation) -> results.FingerGap:
+def find_finger_gap(scene: Scene, motion: Simulation | Trajectory) -> results.FingerGap:
     """Least gap of the fingers, on quintics through the recorded states."""
-    t, z, scene = simulation.t, simulation.z, simulation.problem.scene
+    t, z = motion.t, motion.z
     left = np.repeat(np.flatnonzero(np.diff(t) > 0), 7)
     h = np.diff(t)[left]
     run = h * np.resize(np.arange(1, 8) / 8, len(h))
-    inside = interpolate_quintic(h, run, (z, simulation.z_dot, simulation.z_ddot), left)[0]
+    inside = interpolate_quintic(h, run, (z, motion.z_dot, motion.z_ddot), left)[0]
     times = np.append(t, t[left] + run)
     order = np.argsort(times, kind="stable")
     gaps = evaluate_finger_gap(scene, np.concatenate([z, inside]))
@@ -185,7 +185,7 @@ def judge(
         _report_phase(simulation, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
-    gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
+    gap = find_finger_gap(problem.scene, simulation) if problem.scene.fingers_collide else None
     reached, outcome = simulation.outcome.reached, simulation.outcome.text
     failures = [] if reached else [results.Failure(len(phases), outcome)]
     failures += describe_failures(simulation, phases, gap if reached else None, allowance)
