@@ -67,7 +67,14 @@ def draw_snapshot(
     draw_joints(axes, scene)
     for name in contacts:
         face, _, marker = styles[name]
-        look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
+        look: Any = {
+            "mfc": face,
+            "mec": "white",
+            "mew": 0.9,
+            "zorder": 6,
+            "label": name,
+            "clip_on": False,
+        }
         artists += axes.plot(*locate(scene, name, z[None]).point.T, marker, ms=6.5, **look)
     axes.set(xlim=box[:, 0], ylim=box[:, 1])
     scale = measure_scale(axes)
@@ -102,6 +109,7 @@ def draw_bodies(axes: Axes, scene: Scene, z: Array, **look: Any) -> list[Artist]
 def draw_joints(axes: Axes, scene: Scene) -> list[Artist]:
     """Draw the joints of both fingers."""
     look: Any = {"marker": "o", "ms": 3.2, "mfc": "white", "mew": 0.9, "zorder": 3}
+    look["clip_on"] = False  # whole at the edge, too
     rows = zip(scene.fingers, style.FINGERS, strict=True)
     return [style.add_line(axes, np.array([f.base]), mec=line, **look) for f, (line, _) in rows]
 

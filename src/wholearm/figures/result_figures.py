@@ -103,13 +103,16 @@ def draw_prediction(prediction: Prediction) -> Figure:
     rows = max(math.ceil(len(phases) / columns), 1)
     # Size of a panel with what is written about it, and the room that this takes [in].
     (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
+    forces = [force[0] for each in phases if each.curves for force in each.curves.force.values()]
+    prefix, factor = style.choose_prefix(2.2 * float(np.nanmax([prediction.epsilon, *forces])))
     with style.open_figure(columns * wide, rows * tall + 0.45) as figure:
         for k, phase in enumerate(phases):
             row, column = divmod(k, columns)
             corner = column * wide + left, (rows - 1 - row) * tall + bottom
             axes = style.inset(figure, *corner, wide - left - right, tall - bottom - top)
             _draw_phase(axes, phase, prediction.epsilon)
-            axes.set_ylabel("least $c_n$ [N]" if column == 0 else "")
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda force, _: f"{factor * force:g}"))
+            axes.set_ylabel(f"least $c_n$ [{prefix}N]" if column == 0 else "")
             axes.set_xlabel("speed along the phase [m/s]" if k >= len(phases) - columns else "")
         name = f"{prediction.name}{_DOT}quasistatic motions at speed"
         style.write_title(figure, f"{name}{_DOT}\u03b5 = {prediction.epsilon:g} N", left=0.15)
@@ -125,7 +128,7 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     axes.axhspan(0.0, epsilon, color=style.LOW, linewidth=0, zorder=1)
     axes.axhspan(low, 0.0, color=style.LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
-    above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom", "fontsize": 7.5}
+    above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom"}
     for k, survival in enumerate(phase.survivals):
         colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
         look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
@@ -138,12 +141,13 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
         failure = f"{speed}: {survival.first.name}"
         failure = "keeps \u03b5 at any speed" if survival.speed is None else failure
         text = f"{survival.motion}, {failure}"
+        above["fontsize"] = 7.5 * min(1.0, 54 / len(text))  # to be no wider than the panel
         style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **above)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
         axes.text(0.5, 0.8, "no slow motion keeps its limits", color=style.INK, **middle)
     title = f"phase {phase.number}, until {phase.until}"
-    above |= {"fontsize": 9, "fontweight": "bold"}
+    above |= {"fontsize": 9 * min(1.0, 38 / len(title)), "fontweight": "bold"}
     style.write(axes, title, (0, 1), (0, 41), color=style.INK, **above)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
     wide = curves.speed[-1] > 20.0 * curves.speed[0]
