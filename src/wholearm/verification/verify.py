@@ -807,7 +807,9 @@ def find_resting_changes(
         sizes = np.abs(rows) @ [1.0, unit, unit]
         scale = [limits.side_scales, np.where(sizes > 0, sizes, 1.0)]
         sides = np.vstack([find_sides(limits, path.response, np.zeros(5)), rows])
-        starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
+        slack, slope = normalise(sides, np.concatenate(scale), tau, unit)
+        slack[len(slack) - len(towards) :] -= SURE  # on the verge it would hardly move
+        starts.append((path, (slack, slope)))
     changes: list[results.TorqueAdvice] = []
     for free in _TORQUES:
         if len(free) == 2 and not all(change.holds for change in changes):
