@@ -29,7 +29,7 @@ import wholearm
 
 from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
 from ..common.fields import Range, choice, keys_of, read_options
-from ..common.files import require_ending, require_writable, together, write_text
+from ..common.files import number_same, require_ending, require_writable, together, write_text
 from ..common.signals import listen, on_end
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
@@ -953,7 +953,8 @@ def _sensitivities(options: argparse.Namespace) -> int:
 
 
 def _design(options: argparse.Namespace) -> int:
-    outputs = [f"{Path(path).stem}_design.toml" for path in options.problems]
+    stems = number_same([Path(path).stem for path in options.problems])
+    outputs = [f"{stem}_design.toml" for stem in stems]
     outputs[:1] = [options.output or outputs[0]]
     for path in outputs:
         require_output(path, ".toml")
@@ -975,7 +976,7 @@ def _design(options: argparse.Namespace) -> int:
 def _gallery(options: argparse.Namespace) -> int:
     from ..viewer.report_page import write_gallery
 
-    require_output(options.output, ".md")
+    require_ending(options.output, ".md")
     write_gallery(options.files, options.output, show_progress)
     return finish(options, None, options.output)
 

@@ -30,6 +30,7 @@ from ..analysis.robustness import draw_cube
 from ..common.document import Document, Result, Table, format_csv, plain, show
 from ..common.errors import InfeasibleError, InputError, WholearmError, require_number, suggest
 from ..common.fields import POINT, Field, Range, choice
+from ..common.files import number_same
 from ..common.parallel import Journal, Processes, run_all
 from ..mechanics.limits import make_limits
 from ..planning.options import Objective, PlanOptions
@@ -383,9 +384,7 @@ def sweep(
         titles[name] = name
         with suppress(InputError):
             titles[name] = find_parameter(problem, name).title
-    names = [problem.source or problem.name for problem in listed]
-    if len({*names}) < len(names):
-        names = [f"{name} ({k})" for k, name in enumerate(names, start=1)]
+    names = number_same([problem.source or problem.name for problem in listed], "{} ({})")
     combinations: Iterable[Point] = product(*axes.values())
     if samples:
         low, high = (
