@@ -126,19 +126,14 @@ def test_commands(box_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "today" in capsys.readouterr().out and Path(figure).stat().st_size > 1000
     assert wholearm.solve(wholearm.load(out)).duration > 0
     bars = str(tmp_path / "bars.png")
-    command = [
-        "sensitivities",
-        str(box_file),
-        "--of",
-        "mass",
-        "torque_limit1",
-        "-o",
-        bars,
-        "--json",
-    ]
-    assert main([*command, "--jobs", "1"]) == 0
+    command = ["sensitivities", str(box_file), "--jobs", "1", "--of"]
+    assert main([*command, "mass", "torque_limit1", "-o", bars, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {row["name"] for row in rows} == {"mass", "torque_limit1"}
     assert Path(bars).stat().st_size > 1000
-    assert main(["sensitivities", str(box_file), "--of", "mas"]) == 2
-    assert "did you mean 'mass'" in capsys.readouterr().err
+    for name, words in {
+        "mas": "did you mean 'mass'",
+        "settle": "settle: is no single number here",
+    }.items():
+        assert main([*command, name]) == 2
+        assert words in capsys.readouterr().err

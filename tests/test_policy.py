@@ -330,9 +330,10 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(InputError, match="phase: 3 given"):
         policy.reset(3)
-    np.savez(path, **{**np.load(path), "keeps_1": np.zeros(0)})
-    with pytest.raises(InputError, match=r"keeps_1: float64 of shape \(0,\) given"):
-        Policy.load(path)
+    for value, words in (([], r"float64 of shape \(0,\) given"), ([np.nan], "not finite")):
+        np.savez(path, **{**np.load(path), "keeps_1": np.array(value)})
+        with pytest.raises(InputError, match=f"keeps_1: .*{words}"):
+            Policy.load(path)
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Plan) -> None:

@@ -377,8 +377,8 @@ def sweep(
     goal = PlanOptions(**chosen).goal
     axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
-    for problem, (name, given) in product(listed[::-1], axes.items()):
-        numbers = all(isinstance(value, Real) for value in given)
+    for problem, (name, given) in product(listed[::-1], vary.items()):
+        numbers = all(isinstance(value, Real) and math.isfinite(value) for value in given)
         for value in (min(given), max(given)) if numbers else given:
             require_allowed(problem, name, value, "--vary")
         titles[name] = name
