@@ -79,9 +79,7 @@ def test_assemble_lays_phases_end_to_end(trajectory: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("t, phase, local", [(0.0, 0, 0.0), (0.3, 0, 0.3), (0.7, 1, 0.0)])
-def test_at_asks_the_right_phase(
-    trajectory: Trajectory, t: float, phase: int, local: float
-) -> None:
+def test_at_asks_its_phase(trajectory: Trajectory, t: float, phase: int, local: float) -> None:
     """Forces of contacts of other phases are NaN."""
     motion = MOTIONS[phase]
     own = [trajectory.contacts.index(name) for name in motion.contacts]

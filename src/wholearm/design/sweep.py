@@ -84,7 +84,7 @@ def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
     if name in every:
         return every[name]
     shown = [p.name for p in list_parameters(problem) if not p.name.startswith("object.")]
-    text = f"no number of this problem has that name; {suggest(name, every)}it has "
+    text = f"is no number of a problem; {suggest(name, every)}those that this one gives are "
     raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(shown))
 
 
