@@ -284,6 +284,11 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: Capture) -> None:
     out, err = capsys.readouterr()
     assert err == "" and "FAILED: " in out
     assert "the torques end at t = 0.5 s, phase 1, 0.0236 m short of v3-finger1" in out
+    Path("early.csv").write_text("t,tau1,tau2\n0,3,2.1\n0.5,3,2.1\n")
+    assert main(["verify", str(HEPTAGON), "early.csv", "-o", "a.npz"]) == 1
+    out, err = capsys.readouterr()
+    assert err.startswith("wholearm: a.npz: is not written: there is no motion to keep: c_n of v5")
+    assert "FAILED: c_n of v5-finger2" in out and not Path("a.npz").exists()
 
 
 @pytest.mark.parametrize(

@@ -320,9 +320,7 @@ def test_the_first_phase_may_let_go_of_what_touches() -> None:
         {"phases[5].until": {"phi_deg": -50.0}, "speed_limit1": 20.0, "control_period": 0.005},
     ],
 )
-def test_a_problem_that_is_saved_loads_as_the_same(
-    changes: dict[str, object], tmp_path: Path
-) -> None:
+def test_a_saved_problem_loads_as_the_same(changes: dict[str, object], tmp_path: Path) -> None:
     problem = problem_of(HEPTAGON).with_(changes)
     save(problem, tmp_path / "x.toml")
     loaded = read_problem(str(tmp_path / "x.toml"))
@@ -441,9 +439,7 @@ def get_stiffness(problem: Problem) -> list[Any]:
     return [getattr(finger, "stiffness") for finger in problem.scene.fingers]  # noqa: B009
 
 
-def test_a_new_key_is_read_left_out_changed_and_written(
-    table: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_new_key_is_read_left_out_changed_written(table: dict[str, Any], tmp_path: Path) -> None:
     problem = build_problem(table)
     assert get_stiffness(problem) == [0.0, 0.0]
     assert get_stiffness(problem.with_(stiffness=0.5)) == [0.5, 0.5]
@@ -701,8 +697,9 @@ def test_new_writes_a_file_and_keeps_one_that_is_there(
     text = path.read_text(encoding="utf-8")
     problem = load(str(path))
     assert problem.name == "mine" and problem.scene.polygon.n_vertices == 5
-    assert main(["new", str(path)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    few = [str(tmp_path / "few"), "--vertices", "0,0 1,1"]
+    for words, given in {"is there already": [str(path)], ": 2 corners given; allow": few}.items():
+        assert main(["new", *given]) == 2 and words in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == text
 
 

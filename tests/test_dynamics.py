@@ -137,9 +137,7 @@ def test_symmetric_squeeze_by_hand() -> None:
     np.testing.assert_allclose(c_n[:2], (weight - 2 * up) / 2, rtol=1e-11)
 
 
-def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
-    curves: tuple[Curve, ...],
-) -> None:
+def test_reduced_inertia_has_the_sign_of_the_mass_along_motion(curves: tuple[Curve, ...]) -> None:
     """It vanishes where z_s^T M5 w does, w the vector that no contact force acts on."""
     for formation, z, v, directions in sliding_states(curves, 2):
         kinematics = formation.evaluate(z[None], v[None])

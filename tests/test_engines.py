@@ -280,7 +280,7 @@ def test_what_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[s
         require_same_phases(slide()[0], plan_of(HEPTAGON))
     command = ["export", str(HEPTAGON), "torques.csv", "--mjcf", str(tmp_path / "scene.xml")]
     assert main(command) == 2
-    assert "torques alone have no motion" in capsys.readouterr().err
+    assert "torques alone given; a motion is needed" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

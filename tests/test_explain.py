@@ -203,9 +203,7 @@ def test_a_change_can_be_made(along: errors.InfeasibleError) -> None:
         assert (change.value > own.value) == (own.sign > 0)
 
 
-def test_the_motion_that_misses_least_is_there(
-    along: errors.InfeasibleError, tmp_path: Path
-) -> None:
+def test_the_motion_missing_least_is_there(along: errors.InfeasibleError, tmp_path: Path) -> None:
     motion = along.motion
     # What it is short of most is short by that much in its samples.
     worst = max((s for s in along.shortfalls if s.kind == "press"), key=lambda s: s.amount)

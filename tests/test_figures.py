@@ -618,18 +618,24 @@ def test_what_touches_at_a_place_of_the_map_is_told() -> None:
     assert seen == set(freedoms)
 
 
-def test_a_gallery_shows_every_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gallery_shows_every_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     # Few pictures show as much as many.
     monkeypatch.setattr("wholearm.viewer.movie.FRAMES", 5)
-    problem = tmp_path / "slide.toml"
-    problem.write_text(write_template("slide", 4, 0.05), encoding="utf-8")
-    page = tmp_path / "gallery.md"
-    assert main(["gallery", str(problem), "-o", str(page)]) == 0
+    problem, page, text = tmp_path / "slide.toml", tmp_path / "b/c.md", write_template("s", 4, 0.05)
+    (tmp_path / "weak.toml").write_text(re.sub("(?m)^mass = .*", "mass = 90", text), "utf-8")
+    problem.write_text(text, encoding="utf-8")
+    for other, status in (("none", 2), ("weak", 1)):
+        paths = [str(problem), str(tmp_path / f"{other}.toml")]
+        assert main(["gallery", *paths, "-o", str(page)]) == status
+        assert f"wholearm: {paths[1]}: " in capsys.readouterr().err and not page.exists()
+    assert main(["gallery", str(problem), str(problem), "-o", str(page)]) == 0
     text = page.read_text(encoding="utf-8")
-    assert re.search(r"^\| slide \|.*\| ok \|$", text, re.M)
+    assert re.search(r"^\| slide_1 \|.*\| ok \|$", text, re.M)
     for name in re.findall(r"\]\((.*?)\)", text):
-        assert (tmp_path / name).stat().st_size < 1_000_000
-    assert len(list((tmp_path / "gallery").iterdir())) == 2
+        assert (page.parent / name).stat().st_size < 1_000_000
+    assert len(list(page.with_suffix("").iterdir())) == 4
 
 
 def test_a_report_holds_what_was_given(tmp_path: Path) -> None:

@@ -317,6 +317,8 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
     plan.save(tmp_path / "plan.npz")
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(path)]) == 0
     loaded = Policy.load(path)
+    with pytest.raises(InputError, match=r"policy\.npz: t: array is missing; this is a policy"):
+        wholearm.load_trajectory(path)
     theta, rates = problem.start[3:].tolist(), [0.0, 0.0]
     policy.reset()
     assert loaded.step(theta, rates) == pytest.approx(policy.step(theta, rates), rel=1e-13)
@@ -330,9 +332,10 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
         policy.reset(3)
     with pytest.raises(InputError, match="theta_dot: nan, 0 given"):
         policy.step(theta, [np.nan, 0.0])
-    np.savez(path, **{**np.load(path), "keeps_1": np.zeros(0)})
-    with pytest.raises(InputError, match=r"keeps_1: float64 of shape \(0,\) given"):
-        Policy.load(path)
+    for value, words in (([], r"float64 of shape \(0,\) given"), ([np.nan], "not finite")):
+        np.savez(path, **{**np.load(path), "keeps_1": np.array(value)})
+        with pytest.raises(InputError, match=f"keeps_1: .*{words}"):
+            Policy.load(path)
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Plan) -> None:
@@ -475,9 +478,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     assert (found > least[:, None] - 1e-9).all()
 
 
-def test_contacts_are_kept_in_corners_of_the_ranges(
-    ranged: Problem, ranged_plan: Trajectory
-) -> None:
+def test_contacts_are_kept_in_corners_of_ranges(ranged: Problem, ranged_plan: Trajectory) -> None:
     policy = make.make_policy(ranged, ranged_plan)
     assert policy.about["phases"][0]["share"] == 1.0
     assert policy.duration < 1.6 * ranged_plan.duration
@@ -488,9 +489,7 @@ def test_contacts_are_kept_in_corners_of_the_ranges(
     assert record["reached"] and record["kept"], (record["lost"], record["time"])
 
 
-def test_ranges_that_are_too_wide_are_kept_in_part(
-    ranged: Problem, ranged_plan: Trajectory
-) -> None:
+def test_ranges_too_wide_are_kept_in_part(ranged: Problem, ranged_plan: Trajectory) -> None:
     curve = trace_phase(ranged.phases[0], ranged.start, ())
     s = np.linspace(0.0, curve.length, 11)
     b = 0.05 * (4 * s * (curve.length - s) / curve.length**2)

@@ -525,9 +525,7 @@ def simulation() -> Simulation:
     return simulate(problem_of(HEPTAGON), plan()[1].torque, times=np.linspace(0, 2, 301))
 
 
-def test_a_replay_is_a_trajectory_and_survives_its_file(
-    simulation: Simulation, tmp_path: Path
-) -> None:
+def test_a_replay_is_a_trajectory_and_loads_again(simulation: Simulation, tmp_path: Path) -> None:
     found, torque = simulation.trajectory, plan()[1].torque
     assert isinstance(found, Trajectory) and found.torque is torque
     assert found.contacts == simulation.contacts and len(found.motions) == 5

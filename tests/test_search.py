@@ -410,9 +410,7 @@ def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("bulge, crosses", [(4.0, False), (9.0, True)])
-def test_straight_leg_beside_a_curved_border(
-    heptagon: Problem, bulge: float, crosses: bool
-) -> None:
+def test_a_leg_beside_a_curved_border(heptagon: Problem, bulge: float, crosses: bool) -> None:
     """Where it is less than the tolerance beyond the border, it stays in its cell."""
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
     on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]

@@ -154,6 +154,7 @@ def test_values_are_read(text: str) -> None:
         ({"phases[2].until.x": [0.1]}, "there is no number 2; the list has 1"),
         ({"goal.x": [0.1]}, "--vary goal.x: there is no 'goal'"),
         ({"mass": [-1.0, 0.2, 0.3]}, "--vary mass: -1.0 is not a positive number"),
+        ({"mass": [0.2, np.nan, 0.3]}, "--vary mass: nan is not a positive number (finite)"),
         (
             {"friction_palm": [0.1, 0.2, 20.0]},
             "--vary friction_palm: 20 given; allowed are 0 to 10",

@@ -79,9 +79,7 @@ def test_assemble_lays_phases_end_to_end(trajectory: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("t, phase, local", [(0.0, 0, 0.0), (0.3, 0, 0.3), (0.7, 1, 0.0)])
-def test_at_asks_the_right_phase(
-    trajectory: Trajectory, t: float, phase: int, local: float
-) -> None:
+def test_at_asks_its_phase(trajectory: Trajectory, t: float, phase: int, local: float) -> None:
     """Forces of contacts of other phases are NaN."""
     motion = MOTIONS[phase]
     own = [trajectory.contacts.index(name) for name in motion.contacts]
@@ -300,6 +298,9 @@ def test_the_same_file_in_other_words(tmp_path: Path, text: str) -> None:
         (GOOD.replace("2,-2", "two,-2"), "tau1", "'two' on line 3"),
         (GOOD.replace("2,-2", "2,nan"), "tau2", "'nan' on line 3"),
         (GOOD.replace("2,-2", "inf,2"), "tau1", "'inf' on line 3"),
+        (GOOD.replace("2,-2", "0_2,2"), "tau1", "'0_2' on line 3"),
+        (GOOD.replace("2,-2", "2,-2,9"), "", "4 values on line 3 given; the columns are t,tau1,"),
+        (GOOD.replace("tau2", "tau2,tau2"), "tau2", "column is there twice; t,tau1,tau2,tau2 giv"),
         (GOOD.replace("2,-2", "2"), "tau2", "'' on line 3"),
         (GOOD.replace("2,-2", "2,").replace("\n0,", "\n\n\n0,"), "tau2", "'' on line 5"),
         (GOOD.replace("2,1,3", "0.4,1,3"), "t", "goes back from 0.5 to 0.4"),

@@ -29,7 +29,7 @@ import wholearm
 
 from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
 from ..common.fields import Range, choice, keys_of, read_options
-from ..common.files import require_ending, require_writable, together, write_text
+from ..common.files import number_same, require_ending, require_writable, together, write_text
 from ..common.signals import listen, on_end
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
@@ -498,6 +498,8 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
+            if policy is not None and what == "policy":
+                policy.require_count(len(problem.phases), "problem")
     if getattr(options, "json", False) or getattr(options, "list", ()):
         options.notes = {"notes": notes} if notes else {}
     else:
@@ -558,6 +560,8 @@ def _solve(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
+    from ..common.errors import SimulationError
+
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
     values = list_given(options, *keys)
@@ -569,10 +573,8 @@ def _verify(options: argparse.Namespace) -> int:
     policy = None
     torques: wholearm.Trajectory | wholearm.TorqueProfile
     report: wholearm.Report | wholearm.FreeReport
-    if not _is_table(options.torques):
+    if not _is_table(options.torques) or options.policy is not None:
         problem, torques, policy = load_plan(options, options.torques)
-    elif options.policy is not None:
-        raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
     else:
         problem, torques = read_problem(options), wholearm.read_torque_csv(options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
@@ -587,9 +589,14 @@ def _verify(options: argparse.Namespace) -> int:
     else:
         show_progress(f"replaying {len(problem.phases)} phases")
         report = wholearm.verify(problem, torques, reduced=options.reduced, **values)
+    written = None
     if options.output is not None:
-        report.trajectory.save(options.output)
-    return finish(options, report, options.output)
+        try:
+            report.trajectory.save(options.output)
+            written = options.output
+        except SimulationError as error:
+            _complain(f"{options.output}: is not written: {error}")
+    return finish(options, report, written)
 
 
 def _is_table(path: str) -> bool:
@@ -679,7 +686,7 @@ def _robustness(options: argparse.Namespace) -> int:
     require_output(output, ".jsonl")
     require_output(options.figure)
     require_with(options, "policy", "sensor")
-    problem, plan, policy = load_plan(options, options.plan)
+    problem, plan, policy = _load_replayed(options)
     widths: dict[str, float] = {}
     for text in options.vary:
         name, _, value = text.partition("=")
@@ -799,9 +806,6 @@ def _load_replayed(options: argparse.Namespace) -> LoadedPlan:
     """As `load_plan`, of a plan with the phases of the problem."""
     from ..results.adopt import require_same_phases
 
-    if _is_table(options.plan):
-        text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"
-        raise InputError(options.plan, "", text)
     loaded = problem, plan, _ = load_plan(options, options.plan)
     with name_source(options.plan):
         require_same_phases(problem, plan)
@@ -955,7 +959,8 @@ def _sensitivities(options: argparse.Namespace) -> int:
 
 
 def _design(options: argparse.Namespace) -> int:
-    outputs = [f"{Path(path).stem}_design.toml" for path in options.problems]
+    stems = number_same([Path(path).stem for path in options.problems])
+    outputs = [f"{stem}_design.toml" for stem in stems]
     outputs[:1] = [options.output or outputs[0]]
     for path in outputs:
         require_output(path, ".toml")
@@ -977,7 +982,7 @@ def _design(options: argparse.Namespace) -> int:
 def _gallery(options: argparse.Namespace) -> int:
     from ..viewer.report_page import write_gallery
 
-    require_output(options.output, ".md")
+    require_ending(options.output, ".md")
     write_gallery(options.files, options.output, show_progress)
     return finish(options, None, options.output)
 

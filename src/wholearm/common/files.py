@@ -6,7 +6,7 @@ import json
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -101,6 +101,12 @@ def read_json(path: str) -> Any:
         reason = getattr(error, "strerror", None) or "no JSON"
         text = f"cannot be read: {reason}; --update writes it anew"
         raise InputError(path, "", text) from None
+
+
+def number_same(names: Sequence[str], form: str = "{}_{}") -> list[str]:
+    """The names, if any two are the same all with their number, in a form."""
+    same = len({*names}) < len(names)
+    return [form.format(name, k) if same else name for k, name in enumerate(names, start=1)]
 
 
 def make_folder(path: str, key: str = "") -> None:

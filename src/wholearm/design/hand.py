@@ -206,7 +206,8 @@ class Design(Result):
         text = f"the starts lead to {'one optimum' if same else 'different optima'}"
         lines = [text] if len(optima) > 1 else []
         for plan, today in zip(self.plans, self.aim.today, strict=True):
-            more = f"{100 * (plan.value / today - 1):+.2f} % of today's {today:.6g}"
+            share = 100 * (plan.value / today - 1)
+            more = f"{abs(share):.2f} % {'more' if share > 0 else 'less'} than today's {today:.6g}"
             more = more if math.isfinite(today) else "no plan today"
             lines.append(f"{plan.headline}; {more}")
         return Document("", parts=[*tables, *lines])

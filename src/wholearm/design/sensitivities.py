@@ -23,7 +23,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table, fixed
-from ..common.errors import SolverError, WholearmError
+from ..common.errors import InputError, SolverError, WholearmError
 from ..common.parallel import count_cores, share
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
@@ -292,8 +292,8 @@ def find_sensitivities(
     jobs         processes; as many as cores if left out
     multipliers  whether to use them where that is possible, or differences alone
 
-    InputError if the problem has no number of a name; InfeasibleError, SolverError if the problem
-    itself has no plan.
+    InputError if the problem has no single number of a name; InfeasibleError, SolverError if the
+    problem itself has no plan.
     """
     options = options or PlanOptions()
     options = replace(options, accuracy=min(options.accuracy, ACCURACY))
@@ -305,6 +305,10 @@ def find_sensitivities(
         problem = solve_any(problem, options.goal.value).problem
     require_phases(problem)
     parameters = [find_parameter(problem, name, "--of") for name in names]
+    for one in parameters:
+        if math.isnan(one.value):
+            text = "is no single number here: left out, a share, or different for each finger"
+            raise InputError(problem.source, f"--of {one.name}", text)
     if not names:
         parameters = [p for p in list_parameters(problem) if "vertices" not in p.name]
     progress("planning")

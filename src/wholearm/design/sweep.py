@@ -30,6 +30,7 @@ from ..analysis.robustness import draw_cube
 from ..common.document import Document, Result, Table, format_csv, plain, show
 from ..common.errors import InfeasibleError, InputError, WholearmError, require_number, suggest
 from ..common.fields import POINT, Field, Range, choice
+from ..common.files import number_same
 from ..common.parallel import Journal, Processes, run_all
 from ..mechanics.limits import make_limits
 from ..planning.options import Objective, PlanOptions
@@ -83,7 +84,7 @@ def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
     if name in every:
         return every[name]
     shown = [p.name for p in list_parameters(problem) if not p.name.startswith("object.")]
-    text = f"no number of this problem has that name; {suggest(name, every)}it has "
+    text = f"is no number of a problem; {suggest(name, every)}those that this one gives are "
     raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(shown))
 
 
@@ -376,16 +377,14 @@ def sweep(
     goal = PlanOptions(**chosen).goal
     axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
-    for problem, (name, given) in product(listed[::-1], axes.items()):
-        numbers = all(isinstance(value, Real) for value in given)
+    for problem, (name, given) in product(listed[::-1], vary.items()):
+        numbers = all(isinstance(value, Real) and math.isfinite(value) for value in given)
         for value in (min(given), max(given)) if numbers else given:
             require_allowed(problem, name, value, "--vary")
         titles[name] = name
         with suppress(InputError):
             titles[name] = find_parameter(problem, name).title
-    names = [problem.source or problem.name for problem in listed]
-    if len({*names}) < len(names):
-        names = [f"{name} ({k})" for k, name in enumerate(names, start=1)]
+    names = number_same([problem.source or problem.name for problem in listed], "{} ({})")
     combinations: Iterable[Point] = product(*axes.values())
     if samples:
         low, high = (

@@ -277,10 +277,12 @@ def _read_tables(
         needed = [sizes.get(n, n) for n in shape]
         if name in LATER and isinstance(shape[0], str) and array.shape[:1] == (0,):
             needed[0] = 0
-        fits = array.dtype.kind == "f" and array.ndim == len(shape) and np.isfinite(array).all()
+        fits = array.dtype.kind == "f" and array.ndim == len(shape)
         if not fits or any(w not in (n, "any") for w, n in zip(needed, array.shape, strict=True)):
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape "
             raise InputError("", key, f"{text}({', '.join(map(str, needed))}) needed")
+        if not np.isfinite(array).all():
+            raise InputError("", key, "holds numbers that are not finite")
     if count < 2:
         raise InputError("", f"theta_{number}", "has less than two places")
     axis = "s" if "s" in tables else "starts"

@@ -132,8 +132,8 @@ def read_torque_csv(path: str) -> TorqueProfile:
     Torques are linear between rows; a repeated time is a step. Lines that begin with ``#`` are
     comments; see `read_notes`.
 
-    InputError if the file cannot be read, a column is missing, a value is not a finite number, or
-    the times do not start at 0 and increase.
+    InputError if the file cannot be read, a column is missing or there twice, a row has more values
+    than columns, one is not a finite number, or the times do not start at 0 and increase.
     """
     with _open(path) as stream:
         reader = csv.reader(stream)
@@ -144,11 +144,16 @@ def read_torque_csv(path: str) -> TorqueProfile:
         ]
     header = [cell.strip() for cell in numbered[0][1]] if numbered else []
     for column in COLUMNS:
-        if column not in header:
+        if header.count(column) != 1:
             names = ",".join(header) or "an empty file"
-            text = f"column is missing; {names} given, {','.join(COLUMNS)} needed"
+            fault = "is there twice" if column in header else "is missing"
+            text = f"column {fault}; {names} given, {','.join(COLUMNS)} needed"
             raise InputError(str(path), column, text)
     where = {column: header.index(column) for column in COLUMNS}
+    for line, row in numbered[1:]:
+        if any(map(str.strip, row[len(header) :])):
+            text = f"{len(row)} values on line {line} given; the columns are {','.join(header)}"
+            raise InputError(str(path), "", text)
     values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])
     if len(values) < 2:
         raise InputError(str(path), "t", f"{len(values)} rows given; two or more are needed")
@@ -188,7 +193,8 @@ def _read_row(path: str, line: int, row: list[str], where: Mapping[str, int]) ->
     for column, index in where.items():
         text, value = row[index].strip() if index < len(row) else "", math.nan
         with suppress(ValueError):
-            value = float(text)
+            # Python reads 0_6 as 6, and nothing else does.
+            value = math.nan if "_" in text else float(text)
         if not math.isfinite(value):
             raise InputError(str(path), column, f"{text!r} on line {line} is not a finite number")
         if abs(value) > MOST:

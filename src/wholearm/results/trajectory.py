@@ -277,11 +277,16 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     InputError if the file cannot be read, or an array is missing or of the wrong shape.
     """
     source = str(path)
+    if source.lower().endswith(".csv"):
+        text = "torques alone given; a motion is needed (.npz), which verify -o FILE.npz writes"
+        raise InputError(source, "", text)
     extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}
     arrays = read_arrays(path, (*_ARRAYS, *extra, "meta"))
     missing = next((name for name in (*_ARRAYS, *extra, "meta") if name not in arrays), None)
     if missing:
-        raise InputError(source, missing, "array is missing")
+        is_policy = str(arrays.get("meta")).startswith('{"policy"')
+        text = "; this is a policy, and a plan is needed" if is_policy else ""
+        raise InputError(source, missing, f"array is missing{text}")
     for name, shape in (_ARRAYS | extra).items():
         _check_shape(source, name, arrays, shape)
     _check_order(source, arrays)

@@ -99,9 +99,9 @@ def find_unit_hint(scene: Scene) -> str:
 
 
 def _read_corners(given: object, key: str) -> Array:
-    if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
+    if not isinstance(given, list | tuple | np.ndarray):
         raise InputError("", key, f"{given!r} is not a list of 3 or more points")
-    if len(given) > 500:
+    if not 3 <= len(given) <= 500:
         raise InputError("", key, f"{len(given)} corners given; allowed are 3 to 500")
     return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
 

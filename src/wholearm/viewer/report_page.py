@@ -7,7 +7,9 @@ import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import matplotlib
 import numpy as np
@@ -15,7 +17,8 @@ import numpy as np
 from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
 from ..common.document import Document, Table, fixed, show, write_svg
-from ..common.files import make_folder, write_text
+from ..common.errors import WholearmError
+from ..common.files import make_folder, number_same, require_writable, together, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
@@ -25,6 +28,7 @@ from ..figures.style import STYLE
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import load
 from ..mapping.formation_map import Border, FormationMap, build_map, time_borders
+from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..search import solve
@@ -207,32 +211,39 @@ def write_gallery(
 
     Figures and movies, which last 2 s, go to a folder beside the page that has its name.
 
-    WholearmError if a problem cannot be read or planned; the page is written only if all are.
+    WholearmError if a problem cannot be read or planned; files appear only if all are.
     """
-    folder = os.path.splitext(path)[0]
-    make_folder(folder)
-    rows, pictures = list[tuple[object, ...]](), list[str]()
-    for source in paths:
-        name = os.path.splitext(os.path.basename(source))[0]
-        progress(name)
-        plan = solve(load(source), progress=lambda text, name=name: progress(f"{name}: {text}"))
-        progress(f"{name}: figure and movie")
-        stem = os.path.join(folder, name)
-        plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
-        how: Any = {"speed": plan.duration / 2.0, "resolution": 50}
-        write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
-        report = verify(plan.problem, plan)
-        gap = "" if report.finger_gap is None else report.finger_gap.least
-        least = report.least_force
-        verdict = "ok" if report.ok else "FAILED"
-        rows.append((name, len(plan.phases), plan.value, least and least.value, gap, verdict))
-        place = f"{os.path.basename(folder)}/{name}"
-        links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
-        pictures.append(f"## {plan.problem.name}\n\n{links}")
-    text = (
-        "Least-time plans, each slowed down to 2 s: contact forces in their friction cones, and "
-        "torques as arcs at the joints."
-    )
-    heads = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f"]
-    table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows)
-    write_text(path, Document("Gallery", parts=[text, table, *pictures]).to_markdown())
+    problems, folder = [*map(load, paths)], os.path.splitext(path)[0]
+    make_folder(os.path.dirname(path) or os.curdir)
+    require_writable(path)
+    plans, rows, pictures = list[Plan](), list[tuple[object, ...]](), list[str]()
+    for source, problem in zip(paths, problems, strict=True):
+        try:
+            plans.append(solve(problem, progress=lambda text, s=source: progress(f"{s}: {text}")))
+        except WholearmError as error:
+            error.args = (f"{source}: {str(error).removeprefix(f'{source}: ')}",)
+            raise
+    with together():
+        make_folder(folder)
+        names = number_same([Path(source).stem for source in paths])
+        for name, plan in zip(names, plans, strict=True):
+            progress(f"{name}: figure and movie")
+            stem = os.path.join(folder, name)
+            plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
+            how: Any = {"speed": plan.duration / 2.0, "resolution": 50}
+            write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
+            report = verify(plan.problem, plan)
+            gap = "" if report.finger_gap is None else report.finger_gap.least
+            least = report.least_force
+            verdict = "ok" if report.ok else "FAILED"
+            rows.append((name, len(plan.phases), plan.value, least and least.value, gap, verdict))
+            place = quote(f"{os.path.basename(folder)}/{name}")
+            links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
+            pictures.append(f"## {plan.problem.name}\n\n{links}")
+        text = (
+            "Least-time plans, each slowed down to 2 s: contact forces in their friction cones, "
+            "and torques as arcs at the joints."
+        )
+        heads = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f"]
+        table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows)
+        write_text(path, Document("Gallery", parts=[text, table, *pictures]).to_markdown())
