@@ -165,9 +165,9 @@ def test_meta_says_how_it_was_made(heptagon: Problem, objective: str) -> None:
     assert meta["name"] == heptagon.name and meta["problem"] == heptagon.table
     assert meta["value_unit"] == {"time": "s", "effort": "(N m)^2 s", "margin": "N"}[objective]
     assert sum(meta["phase_durations"]) == pytest.approx(trajectory.duration, rel=1e-14)
-    assert all(
-        len(meta[key]) == 5 for key in ("phase_values", "phase_errors", "iterations", "solves")
-    )
+    for key in ("phase_values", "phase_errors", "iterations", "solves", "iterates"):
+        assert len(meta[key]) == 5
+    assert all(phase[-1]["violation"] <= 1 >= phase[-1]["error"] for phase in meta["iterates"])
     combine = min if objective == "margin" else sum
     assert meta["value"] == pytest.approx(combine(meta["phase_values"]))
     assert 0 <= min(meta["phase_errors"]) <= meta["error"] <= max(meta["phase_errors"])

@@ -349,14 +349,22 @@ class Solver:
         return *sizes, jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
 
 
+class IterateRecord(NamedTuple):
+    """One iterate of a refinement."""
+
+    violation: float  # the largest violation of limits between nodes, over the allowed one
+    error: float  # estimated relative error of the objective; NaN where limits are missed
+
+
 @dataclass(frozen=True)
 class SolverStatistics:
-    """Cost of solving."""
+    """Cost of solving, and what refinements gained by it."""
 
     iterations: int = 0  # of Ipopt
     solves: int = 0  # how often it ran
     build_time: float = 0.0  # [s]: of NLPs that were not cached
     solve_time: float = 0.0  # [s]: of Ipopt
+    iterates: tuple[IterateRecord, ...] = ()
 
     def __add__(self, other: SolverStatistics) -> SolverStatistics:
         return SolverStatistics(*map(add, astuple(self), astuple(other)))

@@ -2,14 +2,17 @@
 
 Both transcriptions (`path_domain.path_plan`, `time_domain.solution`) are refined by this loop. Each
 solve starts from the last solution. After it limits are checked once between the nodes; then the
-mesh is adapted, or limits are tightened by their violations.
+mesh is adapted, or limits are tightened by their violations. Violation and error of each iterate
+are in the statistics of the phase (`meta.iterates`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Protocol, Self, TypeVar
 
 from ..common.errors import SolverError
+from .nlp import IterateRecord, SolverStatistics, book
 
 SOLVES = 40  # most of one refinement
 
@@ -59,9 +62,11 @@ def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
             iterate = iterate.restart()
             continue
         violation = iterate.violation
-        if violation <= 1 and (best is None or iterate.error <= best.error):
+        record = IterateRecord(violation, iterate.error if violation <= 1 else math.nan)
+        book(SolverStatistics(iterates=(record,)))
+        if violation <= 1 and (best is None or record.error <= best.error):
             best = iterate
-            if best.error <= accuracy:
+            if record.error <= accuracy:
                 return best
         iterate = iterate.adapt()
     if best is None:
