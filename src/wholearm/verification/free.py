@@ -133,10 +133,12 @@ def verify_policy(
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
     phases, moment = list[FreePhase](), MOMENT * problem.scene.scales.time
-    warnings = warn("whole", whole)
+    warnings, ends = warn("whole", whole), float(whole.t[-1])
+    if whole.events and whole.events[-1].kind is EventKind.REST:
+        ends = whole.events[-1].time
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
         number, start = phase.number, loop.began[phase.number]
-        stop = loop.began.get(number + 1, float(whole.t[-1]))
+        stop = loop.began.get(number + 1, ends)
         touch = find_touch(whole, list_gained(problem, phase), start)
         losses = tuple(find_losses(whole, phase, start, min(stop, touch), allowed, moment))
         reached = number == count or number + 1 in loop.began
