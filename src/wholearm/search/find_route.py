@@ -280,8 +280,10 @@ class Alternative(Result):
         return Document("", parts=[*self.describe(), route])
 
     def describe(self) -> list[str]:
-        """Value and duration, in lines."""
-        return [f"{self.plan.value:.6f} {self.plan.unit}, {self.plan.duration:.6f} s"]
+        """Phases, value and duration, in lines."""
+        plan, count = self.plan, len(self.problem.phases)
+        value = f"{plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
+        return [f"{count} phase{'s'[: count != 1]}, {value}, {plan.duration:.6f} s in all"]
 
     @property
     def values(self) -> dict[str, Any]:
@@ -328,17 +330,13 @@ class Answer(Alternative):
 
     def describe(self) -> list[str]:
         """Value, bound and statistics of the search, in lines."""
-        plan, count = self.plan, len(self.problem.phases)
-        lines = [
-            f"{count} phase{'s'[: count != 1]}, {plan.options.goal.value} = {plan.value:.6f} "
-            f"{plan.unit}, {plan.duration:.6f} s in all"
-        ]
+        lines = super().describe()
         if not self.complete:
             lines.append("the search ended early: the best route so far")
         if self.bound is not None:
             text = "no route along borders, with stops or impacts, "
             # The bound is at most the duration of the plan.
-            none = self.route.in_cells and self.bound.value >= plan.duration
+            none = self.route.in_cells and self.bound.value >= self.plan.duration
             text += "is faster" if none else f"takes less than {self.bound.value:.6f} s"
             text += "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
             ended = "" if self.bound.complete else " (the search for such routes ended early)"
