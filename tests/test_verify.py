@@ -530,7 +530,7 @@ def test_a_plan_that_holds_and_torques_that_do_not_carry_the_motion() -> None:
     check = replay_check.check_plan(problem, weak, Allowance())
     assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
     # The first phase departs by the braking that it lacks.
-    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
+    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), trajectory) == 1
 
 
 def test_friction_the_wrong_way_is_found_by_the_residual() -> None:

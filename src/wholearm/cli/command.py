@@ -27,7 +27,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import wholearm
 
-from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
+from ..common.errors import (
+    InputError,
+    ReplayError,
+    SimulationError,
+    WholearmError,
+    name_source,
+    require_number,
+)
 from ..common.fields import Range, choice, keys_of, read_options
 from ..common.files import number_same, require_ending, require_writable, together, write_text
 from ..common.signals import listen, on_end
@@ -560,8 +567,6 @@ def _solve(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from ..common.errors import SimulationError
-
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
     values = list_given(options, *keys)

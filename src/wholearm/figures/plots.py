@@ -67,15 +67,9 @@ def draw_snapshot(
     draw_joints(axes, scene)
     for name in contacts:
         face, _, marker = styles[name]
-        look: Any = {
-            "mfc": face,
-            "mec": "white",
-            "mew": 0.9,
-            "zorder": 6,
-            "label": name,
-            "clip_on": False,
-        }
-        artists += axes.plot(*locate(scene, name, z[None]).point.T, marker, ms=6.5, **look)
+        look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "clip_on": False}
+        point = locate(scene, name, z[None]).point
+        artists += axes.plot(*point.T, marker, ms=6.5, label=name, **look)
     axes.set(xlim=box[:, 0], ylim=box[:, 1])
     scale = measure_scale(axes)
     corners = [parse_contact(name, scene) for name in contacts]

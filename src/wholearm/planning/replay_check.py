@@ -16,7 +16,7 @@ from ..common.arrays import Array
 from ..common.errors import InfeasibleError, JammingError, ReplayError, SimulationError, SolverError
 from ..common.files import write_text
 from ..problem.definition import Problem
-from ..results.dwell_record import assemble
+from ..results.dwell_record import HeldMotion, assemble
 from ..results.report import RecordedDeviation, ReplayedPhase, ReplayFigures, Report
 from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
@@ -58,7 +58,7 @@ class ReplayCheck(NamedTuple):
         assert self.report.failed_phase is not None
         return self.report.failed_phase, self.report.reason
 
-    def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
+    def find_culprit(self, scales: Scales, allowance: Allowance, trajectory: Trajectory) -> int:
         """Number of the phase to refine: the first that departs or does not stop, or that fails.
 
         Speed left at a stop times the duration of the next phase counts as a departure, too. So
@@ -66,8 +66,12 @@ class ReplayCheck(NamedTuple):
         phase 2 of a triangle's flip for the largest margin.
         """
         assert self.failure is not None
+        starts = trajectory.phase_starts
+        durations = np.diff(starts)
         following = dict(enumerate(durations[1:].tolist(), start=1))
-        ends = np.cumsum(durations)
+        # A dwell comes after the arrival.
+        lasts = [m.end if isinstance(m, HeldMotion) else m.duration for m in trajectory.motions]
+        ends = starts[:-1] + lasts
         for phase in self.report.phases if isinstance(self.report, Report) else ():
             k = phase.number - 1
             arrival = ends[k] if phase.arrival is None else phase.arrival
@@ -93,8 +97,7 @@ def replay_plan(
         check = check_plan(problem, planning.trajectory, allowance)
         if check.failure is None:
             break
-        durations = np.diff(planning.trajectory.phase_starts)
-        number = check.find_culprit(problem.scene.scales, allowance, durations)
+        number = check.find_culprit(problem.scene.scales, allowance, planning.trajectory)
         # The speed left where phase 8 of query 72 ends is not why phase 12 fails under rate limits.
         suspects = dict.fromkeys((number, check.failure[0]))
         plans = (_improve(planning, phase, check, report) for phase in suspects)
