@@ -692,13 +692,13 @@ def test_what_makes_no_scene_is_refused(given: tuple[int, float, float | None], 
 def test_new_writes_a_file_and_keeps_one_that_is_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "mine.toml"
     assert main(["new", str(tmp_path / "mine"), "--polygon", "5"]) == 0
-    text = path.read_text(encoding="utf-8")
+    text = (path := tmp_path / "mine.toml").read_text(encoding="utf-8")
     problem = load(str(path))
     assert problem.name == "mine" and problem.scene.polygon.n_vertices == 5
     few = [str(tmp_path / "few"), "--vertices", "0,0 1,1"]
-    for words, given in {"is there already": [str(path)], ": 2 corners given; allow": few}.items():
+    cases = {"is there already": [str(path)], ": 2 corners given; allow": few}
+    for words, given in (cases | {"--size: 0.1 given; ": [*few, "--size", "0.1"]}).items():
         assert main(["new", *given]) == 2 and words in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == text
 

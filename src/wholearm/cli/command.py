@@ -15,13 +15,12 @@ import os
 import posixpath
 import re
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from importlib import import_module, resources
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -86,8 +85,8 @@ OBJECTIVE = PLANNING[: PLANNING.index("--accuracy")]
 TABLE = f"""\
 [[new]]  write a problem file to begin with
 name               the problem's name; NAME.toml is written
---polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
---size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
+--polygon CORNERS  corners of the regular polygon, 3 to 50 (7) in 3..50
+--size             from its centre to its corners [m] (0.05) in 1e-6..1e6
 --vertices 'X,Y ...'  corners instead, anticlockwise [m], as in '0,0 0.08,0 0.04,0.06'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
 [[schema]]  print the JSON Schema of problem files, for editors
@@ -1015,6 +1014,8 @@ def _animate(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
+    import tempfile
+
     from ..viewer.report_page import build_report
 
     stem = Path(options.problem).stem
@@ -1042,6 +1043,8 @@ def _help(options: argparse.Namespace) -> int:
 
 def read_page(folder: str) -> str:
     """The page of a folder, with topics in place of links to other pages."""
+    from importlib import resources
+
     page = resources.files("wholearm").joinpath(*folder.split("/"), "README.md")
 
     def name(link: re.Match[str]) -> str:
@@ -1090,15 +1093,18 @@ def _new(options: argparse.Namespace) -> int:
     require_writable(output)
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
+    size = {key: getattr(options, key) for key in ("polygon", "size", "mass")}
+    size = {key: value for key, value in size.items() if value is not None}
     if text := options.vertices:
+        for key in [key for key in size if key != "mass"]:
+            raise InputError("", f"--{key}", f"{size[key]} given; --vertices has the corners")
         try:
             vertices = np.array([[float(x) for x in corner.split(",")] for corner in text.split()])
         except ValueError:
             fault = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
             raise InputError("", "--vertices", fault) from None
     with name_source("--vertices" if vertices is not None else ""):
-        size = options.polygon, options.size, options.mass
-        content = write_template(Path(output).stem, *size, vertices)
+        content = write_template(Path(output).stem, **size, vertices=vertices)
     write_text(output, content)
     print(f"wrote {output}; next: wholearm solve {output}")
     return 0

@@ -495,7 +495,7 @@ def _describe_miss(scene: Scene, leg: Leg, start: Array, stop: Array) -> str:
 
 def write_template(
     name: str,
-    corners: int = 7,
+    polygon: int = 7,
     size: float = _SIZE,
     mass: float | None = None,
     vertices: Array | None = None,
@@ -504,6 +504,7 @@ def write_template(
 
     Parameters
     ----------
+    polygon                number of corners, 3 to 50
     size : [m]             from the centroid to the corners
     mass : [kg]            by default that of a plate as thick and heavy as those in `problems/`
     vertices : (n, 2) [m]  anticlockwise, in place of those of a regular polygon of that size
@@ -515,16 +516,16 @@ def write_template(
     given = vertices is not None
     if vertices is not None:
         body = Polygon(vertices, 1.0)
-        corners, size = body.n_vertices, float(np.hypot(*body.vertices.T).max())
-    if not 3 <= corners <= 50:
-        raise InputError("", "--polygon", f"{corners} given; allowed are 3 to 50")
+        polygon, size = body.n_vertices, float(np.hypot(*body.vertices.T).max())
+    if not 3 <= polygon <= 50:
+        raise InputError("", "--polygon", f"{polygon} given; allowed are 3 to 50")
     scale = require_number(size, "--size", positive=True) / _SIZE
     weight = _MASS * scale**2 if mass is None else require_number(mass, "--mass", positive=True)
     if vertices is None:
-        angles = -math.pi / 2 + math.pi * (2 * np.arange(corners) - 1) / corners
+        angles = -math.pi / 2 + math.pi * (2 * np.arange(polygon) - 1) / polygon
         # Rounded, so that a corner above the centroid is at zero.
         vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
-    few = corners < 5
+    few = polygon < 5
     tried = [(few, 1.2 if few else 0.3)]
     # For given vertices the hand and the start of others may do.
     tried += product((True, False), (1.2, 0.8, 0.3, 0.0)) if given else ()
