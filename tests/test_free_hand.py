@@ -232,8 +232,8 @@ def begin() -> tuple[Problem, Trajectory]:
 
 
 def test_phases_of_a_plan_are_as_told_contact_by_contact() -> None:
-    told: list[str] = []
-    report = verify_free(*begin(), progress=told.append)
+    problem, trajectory = begin()
+    report = verify_free(problem, trajectory, progress=(told := list[str]()).append)
     assert told == ["simulating the whole", *(f"simulating phase {k} of 2" for k in (1, 2))]
     assert report.ok and report.exit_status == 0 and len(report.alone) == 2
     for phase in report.alone:
@@ -245,8 +245,9 @@ def test_phases_of_a_plan_are_as_told_contact_by_contact() -> None:
     assert plain["ok"] and len(plain["events"]) == len(report.whole.events)
     names = {row["contact"] for row in plain["contacts"]}
     assert names >= set(report.whole.problem.phases[0].formation.names)
-    first = report.whole.stretches[0]
-    assert first.start == 0.0 and first.least > 0
+    assert report.whole.stretches[0].start == 0.0 and report.whole.stretches[0].least > 0
+    slow = problem.with_({"speed_limit": 0.1})
+    assert "speed limit of finger 1 = 0.1 rad/s" in verify_free(slow, trajectory).reason
 
 
 def test_torques_alone_are_followed_by_what_happens() -> None:

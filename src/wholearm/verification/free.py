@@ -29,7 +29,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verify import describe_motors
+from .verify import MISSED, describe_misses, describe_motors
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -76,6 +76,8 @@ def verify_free(
         progress("simulating the whole")
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings, beyond = warn("whole", whole), [text for _, text in describe_motors(problem, torque)]
+    most = MISSED if plan is None else allowed
+    beyond += [text for own in problem.phases for text in describe_misses(own, whole, most)]
     if plan is None:
         phases, failures = _follow(whole, allowed)
         warnings = [*beyond, *warnings]
@@ -133,7 +135,8 @@ def verify_policy(
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
     phases, moment = list[FreePhase](), MOMENT * problem.scene.scales.time
-    warnings, ends = warn("whole", whole), float(whole.t[-1])
+    beyond = describe_motors(problem, whole.torque, policy.settings.period)
+    warnings, ends = warn("whole", whole) + [text for _, text in beyond], float(whole.t[-1])
     if whole.events and whole.events[-1].kind is EventKind.REST:
         ends = whole.events[-1].time
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
@@ -141,6 +144,7 @@ def verify_policy(
         stop = loop.began.get(number + 1, ends)
         touch = find_touch(whole, list_gained(problem, phase), start)
         losses = tuple(find_losses(whole, phase, start, min(stop, touch), allowed, moment))
+        warnings += describe_misses(phase, whole, MISSED, (start, stop))
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))

@@ -367,14 +367,18 @@ def _find_least(
         yield name, least, time
 
 
-def describe_misses(phase: Phase, simulation: Simulation, allowed: float) -> list[str]:
-    """Sentences on limits that a phase exceeds by `allowed` of their scale.
+def describe_misses(
+    phase: Phase, simulation: Simulation, allowed: float, span: tuple[float, float] | None = None
+) -> list[str]:
+    """Sentences on limits that a phase exceeds by `allowed` of their scale, in its `span` [s].
 
     Those of forces and torques alone are left out.
     """
-    formation, rows = phase.formation, np.flatnonzero(simulation.phase == phase.index)
-    limits, t = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE), simulation.t[rows]
-    if not limits.limits:
+    formation, t = phase.formation, simulation.t
+    inside = simulation.phase == phase.index
+    rows = np.flatnonzero(inside if span is None else (span[0] <= t) & (t <= span[1]))
+    limits, t = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE), t[rows]
+    if not limits.limits or not len(rows):
         return []
     columns = [simulation.contacts.index(name) for name in formation.names]
     rolling = [columns[row] for row in formation.rolling_rows]
@@ -393,8 +397,13 @@ def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
     return TorqueProfile(torque.breaks, torque.coefficients + change)
 
 
-def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
-    """Sentences on what motors cannot give, with the time of the worst place of each kind [s]."""
+def describe_motors(
+    problem: Problem, torque: TorqueProfile, period: float = 0.0
+) -> list[tuple[float, str]]:
+    """Sentences on what motors cannot give, with the time of the worst place of each kind [s].
+
+    Torques that a law holds over a `period` [s] may step by as much as they may change in it.
+    """
     scene, x = problem.scene, np.linspace(-1, 1, 33)
     torques, rates = torque.at_places(x), torque.slopes.at_places(x)
     commands = torques + scene.actuator_lag[:, None] * rates
@@ -410,8 +419,10 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
         rate, above = f"above its rate limit {fastest:g} N m/s", f"above its limit {limit:g} N m"
         kinds = [(torques, times, (1 + MISSED) * limit, "reaches {:.3g} N m", above)]
         if np.isfinite(fastest) or lag:
+            quickest = min(fastest, 2 * limit / lag) if lag else fastest
+            most_step = max(step, 1.001 * quickest * period)
             kinds += [
-                (torque.jumps, torque.breaks[1:-1], step, "steps by {:.3g} N m", why),
+                (torque.jumps, torque.breaks[1:-1], most_step, "steps by {:.3g} N m", why),
                 (rates, times, 1.001 * fastest + step / lasts, "changes at {:.4g} N m/s", rate),
                 (commands, times, 1.001 * limit, "takes a command of {:.4g} N m", above),
             ]
