@@ -173,7 +173,7 @@ def test_what_is_left_out_is_named() -> None:
     table = {"contacts": ["v1-palm", "v2-finger1"], "until": {"x": 0.04}}
     problem = problem_of(HEPTAGON).with_({"phases": [table]})
     text = slow_speeds.predict(problem).to_text()
-    assert "left out" in text and "has not one or two freedoms" in text
+    assert "left out" in text and "has neither one nor two freedoms" in text
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

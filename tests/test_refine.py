@@ -58,5 +58,5 @@ def test_finer_meshes_are_tried_until_there_is_a_solution() -> None:
     assert refined(0.1, unsolved=2).mesh == 2
     with pytest.raises(SolverError, match="no solution on mesh 0"):
         refined(0.1, unsolved=3)
-    with pytest.raises(SolverError, match="still missed 2 times what is allowed between nodes"):
+    with pytest.raises(SolverError, match="missed by 2 times what is allowed between nodes"):
         refined(0.1, least=2)

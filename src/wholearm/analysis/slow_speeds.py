@@ -477,7 +477,7 @@ class Prediction(Result):
         for phase in self.phases:
             row = phase.number, phase.until, phase.path
             if phase.slow is None:
-                rows.append((*row, None, None, "-", "-", "has not one or two freedoms"))
+                rows.append((*row, None, None, "-", "-", "has neither one nor two freedoms"))
                 continue
             parts = "; ".join(f"{a.to_text()} to {b.to_text()}" for a, b in phase.kept)
             kept, slow = "all along" if phase.is_kept else parts or "nowhere", phase.slow

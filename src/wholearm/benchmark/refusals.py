@@ -184,7 +184,7 @@ def clearances(scene: Scene, z: Array) -> dict[str, Array]:
     apart = {"object and palm": corners[..., 1].min(axis=1)}
     for finger, link in enumerate(scene.fingers):
         base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
-        bones.append(np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1))
+        bones.append(np.stack([base, base + link.length * link_axis(z, finger)], axis=1))
         gap = separate(corners, bones[finger]) - link.radius
         apart[f"object and finger {finger + 1}"] = gap
     if scene.fingers_collide:

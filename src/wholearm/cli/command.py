@@ -168,7 +168,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --step            longest time step [s] (from the scene) in 1e-15..1e6
 --softness        of contacts, over the default, which is proportional to the step (1) in 1e-6..1e6
 --departure       how far a replay may be from the plan, over the object's radius of gyration, and
-    in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
+    in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 1e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
 {JSON}\
 [[policy]]  make torques a function of the joints, by feedback

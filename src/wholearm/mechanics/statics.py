@@ -149,7 +149,7 @@ class Statics:
         answer = self._solve(tau, np.zeros((5, 1)), free, -np.ones(1), presses=True)
         return np.full((2, len(self.A)), np.nan) if answer is None else np.array(answer[:2])
 
-    def find_block(self, epsilon: float, ends: bool = False) -> BlockedStart | None:
+    def find_block(self, epsilon: float, ends: bool) -> BlockedStart | None:
         """Why no motion begins from rest, or `ends` at rest; None if one may.
 
         Formations with more than two degrees of freedom always may.
@@ -188,13 +188,13 @@ class Statics:
                 possible.append((min(margins), tuple(mode.signs.tolist())))
         return possible if modes else None
 
-    def find_epsilon(self, ends: bool = False) -> float | None:
+    def find_epsilon(self, ends: bool) -> float | None:
         """The largest epsilon with which a motion can begin, or end here [N], or None."""
         answers = [self._start(mode, 0.0, cones=True) for mode in self._list_modes(ends)]
         values = [float(one.x[-1]) for one in answers if one is not None]
         return max((value for value in values if value >= 0), default=None)
 
-    def find_torque_limit(self, epsilon: float, finger: int, ends: bool = False) -> float | None:
+    def find_torque_limit(self, epsilon: float, finger: int, ends: bool) -> float | None:
         """The least torque limit of a finger with which a motion can begin, or end here [N m]."""
         answers = [self._start(mode, epsilon, finger) for mode in self._list_modes(ends)]
         values = [float(one.x[[finger, 2 + finger]].sum()) for one in answers if one is not None]

@@ -71,7 +71,7 @@ def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
         iterate = iterate.adapt()
     if best is None:
         raise failure or SolverError(
-            f"limits are still missed {violation:.2g} times what is allowed between nodes after "
+            f"limits are still missed by {violation:.2g} times what is allowed between nodes after "
             "all solves; plan with more intervals"
         )
     return best

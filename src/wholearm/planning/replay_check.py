@@ -59,7 +59,7 @@ class ReplayCheck(NamedTuple):
         return self.report.failed_phase, self.report.reason
 
     def find_culprit(self, scales: Scales, allowance: Allowance, trajectory: Trajectory) -> int:
-        """Number of the phase to refine: the first that departs or does not stop, or that fails.
+        """Number of the phase to plan otherwise: the first that departs, moves on, or fails.
 
         Speed left at a stop times the duration of the next phase counts as a departure, too. So
         does the time of an arrival: a slow motion may come to its end too early by a tenth. Case:

@@ -81,8 +81,8 @@ _STATISTICS = [statistic.name for statistic in fields(SolverStatistics)]
 class Timings(NamedTuple):
     """Seconds that planning took."""
 
-    # trace, plan, replay, assess: tracing curves; everything up to the first plan; its replay with
-    # refinements (in `plan` where a search has replayed parts of a route); gains of impacts
+    # trace, plan, replay, assess: tracing curves; all up to the first plan; its replay, and other
+    # plans of blocks that failed in it (in `plan` where a search has replayed); gains of impacts
     trace: float
     build: float  # build, solve: building NLPs and solving them, in all of these
     solve: float

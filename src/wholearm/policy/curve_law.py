@@ -33,7 +33,7 @@ SAME = 1e-12  # difference of levels that counts as none
 
 @dataclass(frozen=True)
 class LawSettings:
-    """Gains and thresholds of the law along a curve."""
+    """Gains and thresholds of the laws along a curve, over time and with measured forces."""
 
     # Gain on the speed, times the sum of period and delay; on its integral, over the square of that
     # on the speed; largest feedback torque over time, over the torque limit.

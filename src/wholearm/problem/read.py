@@ -294,8 +294,8 @@ def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
 def read_until(scene: Scene, given: object) -> Until:
     """What ends a phase: the name of a contact, or a table of ``contact``, ``phi_deg`` and ``x``.
 
-    Without a contact the first coordinate ends the phase; what else is given has to hold there.
-    InputError for anything else.
+    Without a contact the coordinate with the longest way ends the phase (`Until.lead`); what else
+    is given has to hold there. InputError for anything else.
     """
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))

@@ -169,7 +169,7 @@ def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
     return entry if phase.end.value == "rest" else entry | {"end": phase.end.value}
 
 
-def write_until(until: Until, digits: int = 15) -> Any:
+def write_until(until: Until, digits: int) -> Any:
     """What ends a phase, as its file has it: a name, or a table."""
     if until.contact is not None and not until.pins:
         return until.contact.name

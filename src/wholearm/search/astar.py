@@ -557,7 +557,7 @@ class BorderBound(NamedTuple):
         return self if self.value < enough else BorderBound(enough, True)
 
 
-def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
+def bound_borders(search: RouteSearch, enough: float) -> BorderBound:
     """Bound every route along borders from below, up to `enough` [s].
 
     Dijkstra's algorithm with coarse bounds of edges; those of the shortest route are refined until

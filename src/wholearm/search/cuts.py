@@ -280,7 +280,7 @@ def explain_block(problem: Problem, options: PlanOptions, blocked: Blocked) -> s
 def describe_block(
     search: RouteSearch,
     failures: Sequence[str],
-    opening: str = "",
+    opening: str,
     explain: Callable[[Blocked], str] = lambda blocked: blocked.reason,
 ) -> str:
     """Why nothing leads to a goal: the cut, its violated limits, and the change that opens it."""

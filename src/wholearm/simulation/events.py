@@ -135,7 +135,7 @@ class Simulation(Drawn):
     tau: Array  # (n, 2) [N m]
     phase: Numbers  # (n,): index of the phase, from 0
     contacts: tuple[str, ...]  # every contact of the problem
-    # c_n, c_t (n, m) [N]: naN where a contact is not in the formation, and at rest, where forces
+    # c_n, c_t (n, m) [N]: NaN where a contact is not in the formation, and at rest, where forces
     # are indeterminate
     c_n: Array
     c_t: Array

@@ -1,8 +1,8 @@
 """Motion with prescribed contact formations: phase after phase, from rest in the first one.
 
 Friction has the sliding signs of the current mode, steps end where a polynomial piece of the
-torques ends. At rest the formation waits until it can start (`rest`), or after a motion until the
-next one can that releases a contact.
+torques ends. At rest the formation waits until it can start (`Rest.wait`), or after a motion
+until the next one can that releases a contact.
 
 A phase that ends at rest stops the motion. After a smooth end the velocity is projected onto the
 next formation, and contacts that it does not have are released. A phase without an `until` ends at

@@ -66,7 +66,7 @@ def simulate(
                            touching is moved onto its contact.
     until : [s]            the end, if not that of the torques; those of their end hold after it. A
                            law needs one.
-    restitution            poisson's coefficient, 0 for plastic impacts to 1
+    restitution            Poisson's coefficient, 0 for plastic impacts to 1
     halt                   asked at every event, with the run, whether that is enough
 
     With prescribed contacts:
@@ -87,7 +87,7 @@ def simulate(
                      gives no two numbers, or the step size underflows
     """
     if contacts not in ("prescribed", "free"):
-        raise InputError("", "contacts", f"{contacts!r} given; known: prescribed, free")
+        raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
     wanted = np.asarray(() if times is None else times, dtype=float)

@@ -62,7 +62,7 @@ def verify_free(
     departure    how far the end of a phase may be from the plan, as of `verify`, and how far
                  contacts of a phase may open, over the scene's length: bounces by less are events,
                  but no failure
-    restitution  poisson's coefficient of impacts
+    restitution  Poisson's coefficient of impacts
     progress     told what is simulated
 
     InputError if the trajectory has other contacts than the problem, or a number is out of its

@@ -139,7 +139,7 @@ def place_object(scene: Scene, z: Array) -> Array:
     return z[:, None, :2] + np.stack([_rotate(v, *turn) for v in scene.polygon.vertices], axis=1)
 
 
-def link_axis(scene: Scene, z: Array, finger: int) -> Array:
+def link_axis(z: Array, finger: int) -> Array:
     """Unit vectors from joint to tip, shape (n, 2)."""
     return np.array([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])]).T
 
@@ -156,7 +156,7 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
         normal = np.zeros((len(z), 2), dtype=z.dtype)
         normal[:, 1] = 1.0
     else:
-        link, axis = scene.fingers[finger], link_axis(scene, z, finger)
+        link, axis = scene.fingers[finger], link_axis(z, finger)
         base = np.asarray(link.base)
         tip = base + link.length * axis
         if part.startswith("finger"):

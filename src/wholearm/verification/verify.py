@@ -124,7 +124,7 @@ def verify(
         return verify_free(problem, what, tolerance=tolerance, departure=departure, **options)
     if contacts != "prescribed" or options:
         text = f"{', '.join(options)} needs free ones" if options else f"{contacts!r} given"
-        raise InputError("", "contacts", f"{text}; known: prescribed, free")
+        raise InputError("", "contacts", f"{text}; allowed are prescribed and free")
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)

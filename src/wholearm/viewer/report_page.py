@@ -148,7 +148,7 @@ def list_joints(trajectory: Trajectory) -> Table:
 
 
 @exclusive
-def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[str, dict[str, Any]]:
+def describe_map(chart: FormationMap, plan: Trajectory | None) -> tuple[str, dict[str, Any]]:
     """A map with a plan, or the problem's own phases, as SVG, and what can be clicked on it.
 
     Returns

@@ -626,7 +626,7 @@ class PathIterate:
     def error(self) -> float:
         """Estimated relative error, by the cost of the tightening.
 
-        Over 100 refinements the gap to plans at an accuracy of 1e-7 is 0.8 to 3.9 times that cost
+        Over 75 refinements the gap to plans at an accuracy of 1e-7 is 0.8 to 3.9 times that cost
         where limits are tightened once; 1.5 times is within a factor of 3 either way.
         """
         return _GAP * float(self.paid.sum())

@@ -299,8 +299,8 @@ def solve_guesses(
 ) -> TimeSolution | None:
     """The best plan from guesses that are tried in their order; None without any.
 
-    If the first ones fail, `refuse` may raise an error that says why. `most` is as of
-    `solve_coarse`.
+    If the first ones fail, `refuse` may raise an error that says why. At most `most` solver
+    iterations are made from each in its modes.
     """
     coarse, lost, compared = list[TimeSolution](), list[TimeSolution](), False
     for guess in guesses:
@@ -321,8 +321,8 @@ def solve_guesses(
     return _refine_best(search, coarse)
 
 
-def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> TimeSolution:
-    """Solve from a guess on its intervals, in its modes or those of the friction homotopy."""
+def solve_coarse(search: TimeSearch, guess: Guess, most: int) -> TimeSolution:
+    """Solve from a guess in its modes, by `most` iterations at most, or those of the homotopy."""
     stages = guess.stages
     if guess.homotopy:
         solution = find_modes(search, stages)
