@@ -538,13 +538,11 @@ def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
     tau, rows = trajectory.tau.copy(), np.flatnonzero(trajectory.phase == 2)[90:100]
     dry = problem.scene.dry[4]
     tau[rows, 1] -= 2 * dry * np.sign(trajectory.theta_dot[rows, 1])
-    wrong = replace(trajectory, tau=tau)
-    found = replay_check.find_residual(problem, wrong)
-    assert found.phase == 3
-    assert found.size == pytest.approx(2 * dry / problem.scene.scales.torque, rel=1e-6)
+    found = replay_check.find_residual(problem, wrong := replace(trajectory, tau=tau))
+    size = 2 * dry / problem.scene.scales.torque
+    assert found.phase == 3 and found.size == pytest.approx(size, rel=1e-6)
     assert "finger 2" in found.text and "as joint 2 moves against the sense" in found.text
-    times = [f"at t = {t:.5g} s, phase 3" for t in trajectory.t[rows]]
-    assert any(found.text.endswith(time) for time in times)
+    assert any(found.text.endswith(f" {t:.5g} s, phase 3") for t in trajectory.t[rows])
     check = replay_check.check_plan(problem, wrong, Allowance())
     assert check.failure == (3, found.text)
 
@@ -558,6 +556,8 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     held, figures = replay_check.replay_plan(replace(planning, problem=slide), lambda _: None)
     assert figures.least_c_n.value > slide.epsilon
     assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
+    loss = 1 - planning.plans[0].value / held.plans[0].value
+    assert 1e-3 < loss < held.plans[0].error < 2.5 * loss
     assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
 
 

@@ -24,6 +24,7 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verify import Allowance, describe_motors, find_commands, judge, observe
 from .blocks import BlockPlan, Planning, plan_each
+from .phase_plan import combine
 
 SPARE = 2.0  # additional normal force over a small shortfall
 _LATE = 1e-2  # largest error of an arrival, over the duration of its phase, that is no departure
@@ -151,10 +152,23 @@ def _improve(
         others.append(replace(again, more=planning.more | {index: SPARE * short}))
     for other in others:
         try:
-            return plan_each(other, report)
+            made = plan_each(other, report)
         except (InfeasibleError, SolverError):
             continue
+        return made if other.more is planning.more else _add_loss(planning, made, index)
     return None
+
+
+def _add_loss(planning: Planning, made: Planning, index: int) -> Planning:
+    """The plans that are made with a larger epsilon of a block, whose errors have its cost, too."""
+    before, after = (
+        combine(each.options.goal, [plan.value for plan in each.blocks[index].plans])
+        for each in (planning, made)
+    )
+    blocks, loss = list(made.blocks), abs(after - before) / max(abs(after), 1e-300)
+    plans = [plan._replace(error=plan.error + loss) for plan in blocks[index].plans]
+    blocks[index] = replace(blocks[index], plans=plans)
+    return replace(made, blocks=tuple(blocks))
 
 
 def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float:

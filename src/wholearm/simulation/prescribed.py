@@ -823,7 +823,10 @@ class Replay(Run):
         `longest` is the time between them, over the scene's.
         """
         rows, window = list[int](), longest * self.system.scales.time
-        if self.coming_step - self.t <= window:
+        # A phase passed at speed may end before. Case: a pentagon (0, 0), (60, 0), (75, 30),
+        # (30, 60), (-10, 35) mm, where e3-tip2 goes on as v4-tip2 1 us after a torque step.
+        ending = self.passes and self.is_there()
+        if self.coming_step - self.t <= window and not ending:
             self.records.pop()
             while True:
                 self.coast(self.stop)
