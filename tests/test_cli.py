@@ -70,8 +70,7 @@ def test_solve_writes_the_plan(folder: Path, capsys: Capture) -> None:
     error = f"{max(plan.meta['error'], 1e-9):.0e}"
     assert lines[5].startswith("contact forces unique: margin 0.")
     assert lines[6] == f"solved: time = {took} (to {error}), {took} in all; wrote a.npz"
-    assert main(["verify", path, "a.csv"]) == 0
-    assert len(plan.t) == 2 * 21
+    assert main(["verify", path, "a.csv"]) == 0 and len(plan.t) == 2 * 21
     assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")
     assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz", "problem.toml"]
 
@@ -263,8 +262,7 @@ def test_output_that_is_a_device(folder: Path) -> None:
 )
 def test_bad_arguments(folder: Path, capsys: Capture, arguments: list[str], words: str) -> None:
     message = fails(capsys, 2, *arguments)
-    assert words in message
-    assert list(folder.iterdir()) == []
+    assert words in message and list(folder.iterdir()) == []
 
 
 def test_verify_torques_as_json(folder: Path, capsys: Capture) -> None:
@@ -375,8 +373,7 @@ def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
     process.stdout.close()
     assert process.stderr.read() == b""
     process.stderr.close()
-    assert process.wait() == 1
-    assert Path("out.toml").exists()
+    assert process.wait() == 1 and Path("out.toml").exists()
 
 
 def list_parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:

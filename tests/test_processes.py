@@ -67,8 +67,7 @@ def fail() -> None:
 def test_tasks_are_done_by_two_processes_at_the_same_time() -> None:
     assert can_fork() and count_cores() >= 1
     one, other = share([Meeting()] * 2, 2)
-    assert PARENT in (one, other) and one != other
-    assert not multiprocessing.active_children()
+    assert PARENT in (one, other) and one != other and not multiprocessing.active_children()
 
 
 @needs_fork
@@ -226,11 +225,11 @@ def run_signalled(work: str, path: Path, number: signal.Signals = signal.SIGINT)
 
 
 COMMAND = """
-import functools, os, signal, sys, time
+import contextlib, functools, os, signal, sys, time
 from pathlib import Path
 from wholearm.cli.command import hasten
 from wholearm.common.files import together, write_whole
-from wholearm.common.signals import beat, guard, held, yielding
+from wholearm.common.signals import beat, guard, held, interruptible, yielding
 
 stop = functools.partial(signal.raise_signal, int(sys.argv[1]))
 
@@ -265,11 +264,19 @@ with together():
     write_whole("one", lambda stream: stream.write(b"whole"))
     write_whole("two", write)
 """
+DROPPED = """
+signal.signal(signal.SIGINT, signal.default_int_handler)
+with interruptible():
+    with contextlib.suppress(KeyboardInterrupt):
+        stop()
+    beat()
+    Path("reached").touch()
+"""
 
 
 @BOTH
 @pytest.mark.parametrize(
-    ("work", "left"), [(HALF, []), (HELD, ["one", "two"]), (TOGETHER, ["one"])]
+    ("work", "left"), [(HALF, []), (HELD, ["one", "two"]), (TOGETHER, ["one"]), (DROPPED, [])]
 )
 def test_a_signal_ends_a_command(
     work: str, left: list[str], number: signal.Signals, tmp_path: Path
@@ -581,8 +588,7 @@ def test_a_full_disk_is_reported(tmp_path: Path) -> None:
 
     with pytest.raises(InputError, match="cannot be written: No space left") as caught:
         write_whole(tmp_path / "out.txt", write)
-    assert caught.value.source == str(tmp_path / "out.txt")
-    assert list(tmp_path.iterdir()) == []
+    assert caught.value.source == str(tmp_path / "out.txt") and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("mask, bits", [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
@@ -609,8 +615,7 @@ def test_a_link_keeps_pointing_to_its_file(tmp_path: Path) -> None:
     (tmp_path / "real.txt").write_bytes(b"old")
     (tmp_path / "link.txt").symlink_to("real.txt")
     write_whole(tmp_path / "link.txt", lambda stream: stream.write(b"new"))
-    assert (tmp_path / "link.txt").is_symlink()
-    assert (tmp_path / "real.txt").read_bytes() == b"new"
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_bytes() == b"new"
 
 
 def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:

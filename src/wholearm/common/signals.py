@@ -124,6 +124,32 @@ def yielding() -> Iterator[None]:
         _yielding = _stopping = False
 
 
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Have SIGINT raise KeyboardInterrupt at the next `beat`, too: CasADi may drop the first one.
+
+    That is for programs with the handler of Python, which raises it once.
+    """
+    global _stopping
+    handler, main = signal.default_int_handler, threading.main_thread()
+    if threading.current_thread() is not main or signal.getsignal(signal.SIGINT) is not handler:
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        global _stopping
+        _stopping = True
+        handler(number, frame)
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+        check()
+    finally:
+        _stopping = False
+        signal.signal(signal.SIGINT, handler)
+
+
 def check() -> None:
     """Raise KeyboardInterrupt if a signal asks for the end of what is done here (`yielding`)."""
     if _stopping:

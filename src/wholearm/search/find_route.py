@@ -26,7 +26,7 @@ from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
-from ..common.signals import OutOfTime, Reporter, limited, yielding
+from ..common.signals import OutOfTime, Reporter, interruptible, limited, yielding
 from ..geometry.tracing import HELD
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
@@ -92,7 +92,7 @@ def find_route(
     if jobs < 1:
         raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
     plan_options = PlanOptions(objective=objective, **options)
-    with limited(time_limit):
+    with interruptible(), limited(time_limit):
         report = Reporter(progress)
         if not problem.goals:
             reason = "is missing; allowed is flush or phi_deg, and x"
