@@ -273,6 +273,7 @@ The function of its name, after an underscore, carries a command out."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
+    options = argparse.Namespace()
     try:
         words = prepare(sys.argv[1:] if arguments is None else arguments)
         options = build_parser(words).parse_args(words)
@@ -285,6 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except WholearmError as error:
+        if isinstance(error, InputError) and not error.source and hasattr(options, error.key):
+            error = InputError("", f"--{error.key.replace('_', '-')}", error.problem)
         _complain(str(error))
         return error.exit_status
     except OSError as error:
@@ -1061,7 +1064,7 @@ def read_page(folder: str) -> str:
 
 
 def _completion(options: argparse.Namespace) -> int:
-    choice("bash", "zsh", "tcsh").read(options.shell, "shell")
+    choice("bash", "zsh", "tcsh").read(options.shell, "SHELL")
     try:
         import shtab
     except ImportError:
