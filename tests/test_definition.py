@@ -84,8 +84,7 @@ def test_heptagon_is_read() -> None:
 def test_defaults() -> None:
     def edit(table: dict[str, Any]) -> None:
         del table["name"], table["gravity"]
-        for key in ("viscous", "dry"):
-            del table["fingers"]["1"][key]
+        del table["fingers"]["1"]["viscous"], table["fingers"]["1"]["dry"]
 
     problem = read_edited(edit)
     finger = problem.scene.fingers[0]
@@ -257,6 +256,8 @@ def test_ends_are_read() -> None:
         ("mass = 0.2", "mass = 0.2\nmass = 0.3", "", "is not TOML"),
         ('"v5-finger2"]\nuntil', '"v9-finger2"]\nuntil', "phases[1].contacts", "does not exist"),
         (TEXT, "", "epsilon", "is missing"),
+        ("epsilon", "settle_gap = 1e-4\nepsilon", "settle_gap", "given without settle, and has no"),
+        ("epsilon", "control_hold = 'linear'\nepsilon", "control_hold", "without control_period"),
         # Those below need the curves.
         ('until = "v6-finger2"', 'until = "v2-palm"', "phases[2].until", "never reached"),
         ('until = "v6-finger2"', "until = { x = -9.0 }", "phases[2].until", "never reached"),
@@ -316,7 +317,7 @@ def test_the_first_phase_may_let_go_of_what_touches() -> None:
     [
         {"friction": 0.11, "name": 'a "b" \\ \u00fc', "fingers_collide": False, "inertia": 3e-4},
         {"uncertainty": {"mass": 0.1, "friction": 0.2}, "settle": "10 %", "settle_gap": 1e-4},
-        {"phases": None, "goal": [{"flush": 1}, {"phi_deg": -50.0, "x": 0.01}]},
+        {"phases": None, "goal": [{"flush": 1}, {"phi_deg": -50.0, "x": 0.01}], "settle_gap": 1e-4},
         {"phases[5].until": {"phi_deg": -50.0}, "speed_limit1": 20.0, "control_period": 0.005},
     ],
 )
@@ -410,9 +411,8 @@ def test_what_only_objects_can_say_wrongly() -> None:
 
 
 def test_a_start_that_no_file_can_say_leaves_the_table_empty() -> None:
-    given = problem_of(HEPTAGON)
-    start = trace_phases(given)[3].end
-    made = rebuild(given, start=start, phases=(replace(given.phases[4], index=0),))
+    own = problem_of(HEPTAGON)
+    made = rebuild(own, start=trace_phases(own)[3].end, phases=(replace(own.phases[4], index=0),))
     assert made.table == {} and copy.deepcopy(made).table == {}
 
 

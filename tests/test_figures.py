@@ -32,7 +32,7 @@ import scenes
 import wholearm
 from plane import place_corners
 from scenes import hexagon
-from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
+from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of, verified
 from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -483,7 +483,7 @@ def test_a_motion_survives_its_page() -> None:
 
 
 def test_tables_say_what_the_joints_of_phases_are() -> None:
-    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    problem, plan, replay = problem_of(LANDING), plan_of(LANDING), verified(LANDING).trajectory
     phases, joints = list_phases(problem, plan), list_joints(plan)
     for table, count in ((phases, 6), (joints, 5)):
         assert {len(row) for row in table.rows} == {len(table.columns)}
@@ -492,9 +492,10 @@ def test_tables_say_what_the_joints_of_phases_are() -> None:
     assert duration == pytest.approx(plan.duration, abs=1e-5)
     # The fourth ends at rest, the fifth smoothly: at a speed, the same on both sides.
     speeds = [row[joints.heads.index("speed before [m/s]") :][:2] for row in joints.cells]
-    assert speeds[3] == ["0.0000", "0.0000"]
-    assert speeds[4][0] == speeds[4][1] != "0.0000"
+    assert speeds[3] == 2 * ["0.0000"] and speeds[4][0] == speeds[4][1] != "0.0000"
     assert "v3-finger1: 0.050 \u2192 -" in joints.cells[4][1]
+    # One contact opens at each, in the replay, too.
+    assert [row[1].count("\u2192 -") for row in list_joints(replay).cells] == 5 * [1]
 
 
 def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
@@ -810,8 +811,7 @@ def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
     path = change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0)
     loaded = load_plan(path)
     assert loaded.value == made.value and loaded.phases[0].duration == made.phases[0].duration
-    options = PlanOptions("effort", intervals=20, time_weight=2.0, replay=False)
-    assert loaded.options == options
+    assert loaded.options == PlanOptions("effort", intervals=20, time_weight=2.0, replay=False)
     assert loaded.replay is None and loaded.transitions == ()
     assert loaded.statistics.solves == made.statistics.solves
 

@@ -311,8 +311,8 @@ def test_limited_torques_change_into_a_dwell_and_out_of_it(
     plan = solve(problem, intervals=40)
     torque, starts = plan.trajectory.torque, plan.trajectory.phase_starts
     # Neither steps, rates nor commands beyond the limits, and the replay reaches the goal.
-    assert describe_motors(problem, torque) == []
-    assert verify(problem, plan).ok
+    assert describe_motors(problem, torque) == [] and verify(problem, plan).ok
+    assert f"{0.02 / plan.value:.1%} of the motion's {plan.value:.6f} s; torq" in plan.to_text()
     # Each phase ends with the torques of its dwell, for as long as that lasts.
     for phase, end in zip(plan.phases, starts[1:], strict=True):
         assert phase.settling is not None and phase.settling.duration == 0.01

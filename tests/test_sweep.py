@@ -38,8 +38,7 @@ def test_rows_are_plans(box: Problem, result: Sweep) -> None:
     assert [(row["torque_limit"], row["mass"]) for row in result.rows] == [
         (torque, mass) for torque in GRID["torque_limit"] for mass in GRID["mass"]
     ]
-    plan = wholearm.solve(box.with_(torque_limit=1.0, mass=0.25))
-    row = result.rows[3]
+    plan, row = wholearm.solve(box.with_(torque_limit=1.0, mass=0.25)), result.rows[3]
     assert row["value"] == plan.value and row["duration1"] == plan.phases[0].duration
     assert row["status"] == "planned" and row["verify"] == "ok"
     assert row["margin"] == pytest.approx(0.0, abs=1e-6)
@@ -108,9 +107,8 @@ def test_a_row_that_crashes_is_done_again(box: Problem, tmp_path: Path) -> None:
 
 
 def test_samples_are_a_latin_hypercube(box: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        Planner, "run", lambda *_: {"status": "failed", "value": None, "reason": ""}
-    )
+    none = {"status": "failed", "value": None, "reason": ""}
+    monkeypatch.setattr(Planner, "run", lambda *_: none)
     drawn = partial(sweep, box, {"mass": (0.1, 0.3), "epsilon": (0.0, 0.1)}, start=ONE, samples=8)
     rows = drawn(seed=1).rows
     for name, low, high in (("mass", 0.1, 0.3), ("epsilon", 0.0, 0.1)):
@@ -155,10 +153,7 @@ def test_values_are_read(text: str) -> None:
         ({"goal.x": [0.1]}, "--vary goal.x: there is no 'goal'"),
         ({"mass": [-1.0, 0.2, 0.3]}, "--vary mass: -1.0 is not a positive number"),
         ({"mass": [0.2, np.nan, 0.3]}, "--vary mass: nan is not a positive number (finite)"),
-        (
-            {"friction_palm": [0.1, 0.2, 20.0]},
-            "--vary friction_palm: 20 given; allowed are 0 to 10",
-        ),
+        ({"friction_palm": [0.1, 20.0]}, "--vary friction_palm: 20 given; allowed are 0 to 10"),
         ({"control_hold": ["linear", "cubic"]}, "--vary control_hold: 'cubic' given; allowed are"),
     ],
 )
@@ -238,17 +233,22 @@ def test_the_command_writes_table_and_figure(
     given = ["sweep", box.source, "--vary", "mass=0.2:0.3:2", "--no-replay"]
     assert main([*given, "--figure", "mass.png"]) == 0
     assert {file.name for file in tmp_path.iterdir()} == {
-        "box_mass.csv", "box_mass.jsonl", "mass.png"
+        "box_sweep_mass.csv", "box_sweep_mass.jsonl", "mass.png"
     }  # fmt: skip
     assert "2 of 2 points planned" in capsys.readouterr().out
-    table = Path("box_mass.csv").read_text()
+    table = Path("box_sweep_mass.csv").read_text()
     assert main([*given, "--json"]) == 0
     assert [row["mass"] for row in json.loads(capsys.readouterr().out)["rows"]] == [0.2, 0.3]
-    assert Path("box_mass.csv").read_text() == table
+    assert Path("box_sweep_mass.csv").read_text() == table
     assert main([*given, "--vary", "phases[1].until.x=0.2,0.3", "-o", "none.csv"]) == 1
     assert "no point has a plan" in capsys.readouterr().out
     four = ["mass=1,2", "x=1,2", "epsilon=1,2", "gravity=1,2", "--figure", "mass.png"]
-    assert main(["sweep", box.source, "--vary", *four]) == 2
-    assert "--figure: drawn are 1 to 3 parameters" in capsys.readouterr().err
-    assert main([*given, "--with", "verify,fre"]) == 2
-    assert "--with: 'fre' given" in capsys.readouterr().err
+    Path("own.csv").write_text("t,tau1,tau2\n0,0,0\n")
+    for more, text in (
+        (["--vary", *four], "--figure: drawn are 1 to 3 parameters"),
+        (["--with", "verify,fre"], "--with: 'fre' given"),
+        (["-o", "own.csv"], "own.csv: holds no table of a sweep; --fresh replaces it"),
+    ):
+        assert main([*given, *more]) == 2 and text in capsys.readouterr().err
+    assert main([*given[:2], *given[-1:], "-o", "own.csv", "--fresh"]) == 0
+    assert re.search(r"best: time \[s\] = [0-9.]+\nwrote own.csv", capsys.readouterr().out)

@@ -92,7 +92,7 @@ class Comparison(Result):
     def summary(self) -> Table:
         """What each comes to."""
         columns = {
-            "name": "", "verdict": "verdict", "duration": "duration [s]:.5f",
+            "name": "", "verdict": "verdict", "duration": "until the goal [s]:.5f",
             "effort": "effort [(N m)^2 s]:.5f", "margin": "least margin [N]:+z.5f", "place": "of",
             "peaks": "peak torques [N m]:.4f", "lost": "energy lost [J]:.5f",
             "simulations": "simulations:d",
@@ -109,7 +109,7 @@ class Comparison(Result):
         margins = zip_longest(*(contender.margins for contender in self.contenders))
         pairs = zip(lasts, margins, strict=True)
         rows = [(number, *one, *two) for number, (one, two) in enumerate(pairs, start=1)]
-        title = "phases: durations [s], then least margins [N]"
+        title = "phases: times until their ends [s], then least margins [N]"
         phases = Table(["phase:d", *heads], rows, title)
         head = f"{self.name}, epsilon = {self.epsilon:g} N"
         return Document(head, parts=[*failed, self.summary, phases])

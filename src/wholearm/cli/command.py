@@ -217,8 +217,8 @@ problems PROBLEM ...   problem files (TOML)
 --samples N            points of a Latin hypercube in place of the grid = 0 in 0..1000000
 --seed K               of the samples = 0 in 0..9223372036854775808
 --with CHECKS          what plans are tried with: verify, free, policy, or several with commas
--o --output FILE       table to write (.csv; default: NAME_PARAMETERS.csv). Rows are kept in a
-    .jsonl file beside it as they come; a sweep that is there goes on where it was stopped
+-o --output FILE       table to write (.csv; default: NAME_sweep_PARAMETERS.csv). Rows are kept in
+    a .jsonl file beside it as they come; a sweep that is there goes on where it was stopped
 --fresh                begin these files anew, whatever they hold
 --figure FILE          also draw (.png, .pdf, .svg) a curve over one parameter, contours over two,
     small multiples over three
@@ -273,6 +273,7 @@ The function of its name, after an underscore, carries a command out."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
+    options = argparse.Namespace()
     try:
         words = prepare(sys.argv[1:] if arguments is None else arguments)
         options = build_parser(words).parse_args(words)
@@ -285,6 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except WholearmError as error:
+        if isinstance(error, InputError) and not error.source and hasattr(options, error.key):
+            error = InputError("", f"--{error.key.replace('_', '-')}", error.problem)
         _complain(str(error))
         return error.exit_status
     except OSError as error:
@@ -920,13 +923,15 @@ def _policy(options: argparse.Namespace) -> int:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from ..design.sweep import read_vary
+    from ..design.sweep import read_vary, require_table
     from ..problem.read import read_problem
 
     vary = read_vary(options.vary, options.samples)
     names = (re.sub(r"\W+", "_", name).strip("_") for name in vary)
-    output = options.output or f"{'_'.join([Path(options.problems[0]).stem, *names])}.csv"
+    output = options.output or f"{'_'.join([Path(options.problems[0]).stem, 'sweep', *names])}.csv"
     require_output(output, ".csv")
+    if not options.fresh:
+        require_table(output)
     require_output(options.figure)
     if options.figure is not None:
         from ..figures.result_figures import choose_axes
@@ -1059,7 +1064,7 @@ def read_page(folder: str) -> str:
 
 
 def _completion(options: argparse.Namespace) -> int:
-    choice("bash", "zsh", "tcsh").read(options.shell, "shell")
+    choice("bash", "zsh", "tcsh").read(options.shell, "SHELL")
     try:
         import shtab
     except ImportError:

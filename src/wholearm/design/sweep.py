@@ -28,7 +28,14 @@ import numpy as np
 from .. import __version__
 from ..analysis.robustness import draw_cube
 from ..common.document import Document, Result, Table, format_csv, plain, show
-from ..common.errors import InfeasibleError, InputError, WholearmError, require_number, suggest
+from ..common.errors import (
+    InfeasibleError,
+    InputError,
+    WholearmError,
+    name_file,
+    require_number,
+    suggest,
+)
 from ..common.fields import POINT, Field, Range, choice
 from ..common.files import number_same
 from ..common.parallel import Journal, Processes, run_all
@@ -286,8 +293,8 @@ class Sweep(Result):
             rows.append([(row | cells).get(key) for key in columns])
         last = f"no point has a plan, most often because of: {next(iter(reasons), '')}"
         if best is not None:
-            place = ", ".join(f"{name} = {show(self.rows[best][name], '.6g')}" for name in names)
-            last = f"best: {self.label} = {self.rows[best]['value']:.6g}, {place}"
+            place = [f"{name} = {show(self.rows[best][name], '.6g')}" for name in names]
+            last = ", ".join([f"best: {self.label} = {self.rows[best]['value']:.6g}", *place])
         table = Table([*columns.values()], rows, most=100)
         causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
         reason = f"{len(rows) - sum(reasons.values())} of {len(rows)} points planned"
@@ -297,6 +304,16 @@ class Sweep(Result):
         """All rows as CSV, with all digits."""
         keys = (key for row in sorted(self.rows, key=len)[::-1] for key in row)
         return format_csv(self.rows, dict.fromkeys(keys))
+
+
+def require_table(path: str) -> None:
+    """Raise an `InputError` if a file is there that is no table of a sweep, and not empty."""
+    if os.path.isfile(path):
+        with name_file(path), open(path, "rb") as stream:
+            head = stream.readline()
+        if head and not re.match(rb"problem,(.*,)?status,value,", head):
+            text = "holds no table of a sweep; --fresh replaces it, or choose another with -o"
+            raise InputError(path, "", text)
 
 
 def read_vary(

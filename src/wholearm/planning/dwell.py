@@ -187,11 +187,13 @@ def settle_plans(problem: Problem, plans: Plans) -> Plans:
     else:
         times = [problem.settles(phase) or 0.0 for phase in problem.phases]
         ends = find_ends(problem, places, times)
-    triples = zip(hold_plans(problem, plans, ends), problem.phases, ends, strict=True)
-    return [
-        plan if end is None else plan._replace(settling=_describe(problem, phase, end))
-        for plan, phase, end in triples
-    ]
+    held, whole = hold_plans(problem, plans, ends), sum(plan.motion.duration for plan in plans)
+    for k, (phase, end) in enumerate(zip(problem.phases, ends, strict=True)):
+        if end is not None:
+            settling = _describe(problem, phase, end)
+            share = settling.duration / whole
+            held[k] = held[k]._replace(settling=settling._replace(share=share))
+    return held
 
 
 def find_ends(

@@ -27,7 +27,8 @@ PLANNER = """\
 --accuracy          relative error of the objective below which refining ends = 1e-4 in 1e-8..0.1
 --intervals         intervals of each phase along a curve (as many as the accuracy needs)
     in 10..5000
---duration          longest duration, for margin [s] (twice the least time) in 1e-9..1e9
+--duration          longest duration without dwells (settle), for margin [s] (twice the least time)
+    in 1e-9..1e9
 --time-weight       weight of time, for effort [(N m)^2] = 1 in 1e-30..1e30
 --samples           rows per phase of the trajectory file = 201 in 2..100000
 --transcription NAME  auto, or time for the time domain throughout = auto among auto|time

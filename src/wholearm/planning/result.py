@@ -321,9 +321,12 @@ def _list_settlings(plan: Plan) -> Iterator[str | Table]:
     heads = ["phase:d", "held [ms]:.3g", "tau [N m]:8.4f", "closes", "from [mm]:.3g"]
     heads += ["in [ms]:.3g", "left [mm]:.2g", "at [mm/s]:.3g", "parts for a moment"]
     yield Table(heads, rows)
-    held = sum(dwell.duration for dwell in dwells)
     yield from (f"warning: {dwell.warning}" for dwell in dwells if dwell.warning)
-    yield f"held for {held:.6g} s in all, {held / (plan.duration - held):.1%} of the motion"
+    held, share = (sum(getattr(dwell, key) for dwell in dwells) for key in ("duration", "share"))
+    text, whole = f"held for {held:.6g} s in all", held / share if share else plan.duration - held
+    more = plan.duration - held - whole
+    changes = f"; torques change into and out of that for {more:.6g} s more"
+    yield f"{text}, {share:.1%} of the motion's {whole:.6f} s{changes * (more > 1e-9 * whole)}"
 
 
 def _describe_held(plan: Plan) -> Iterator[str]:

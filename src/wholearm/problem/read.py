@@ -53,6 +53,7 @@ from .definition import (
     read_widths,
     spread_widths,
 )
+from .table import NEEDED
 
 Table = Mapping[str, Field]
 """Keys of a table by name."""
@@ -133,7 +134,12 @@ def read_problem(path: str) -> Problem:
         raise InputError(str(path), "", f"is not TOML: {error}") from None
     except RecursionError:
         raise InputError(str(path), "", "is nested too deeply") from None
-    return build_problem(table, str(path))
+    problem = build_problem(table, str(path))
+    for key, needed in NEEDED.items():
+        if key in table and not any(needed in part for part in (table, *table.get("phases", ()))):
+            text = f"{table[key]!r} given without {needed}, and has no effect without it"
+            raise InputError(str(path), key, text)
+    return problem
 
 
 @exclusive

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 
 SAME = 9  # decimals of an angle in degrees that a printed phase has at most
+NEEDED = {"settle_gap": "settle", "control_hold": "control_period"}
+"""Keys of a file that have no effect without another one."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 
 
@@ -109,6 +111,9 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         for key, value, field in _list_values((prefix, part)):
             if field.required or value != field.shown_default:
                 _set(table, key, value)
+    for key, needed in NEEDED.items():
+        if key in table:
+            table.setdefault(needed, 0.0)
     return table
 
 

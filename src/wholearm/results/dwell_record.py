@@ -124,6 +124,7 @@ class Settling(NamedTuple):
     speed: float = 0.0  # [m/s]: most with which the contact is reached; 0 if others open before
     parts: tuple[str, ...] = ()  # contacts that would have to pull in that impact, and part
     warning: str = ""  # what the torques do not do; empty if nothing
+    share: float = 0.0  # its duration over that of the whole motion without dwells
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,8 +129,10 @@ def list_joints(trajectory: Trajectory) -> Table:
     force = fixed(min(float(np.nanmax(trajectory.c_n, initial=0.0)), 10.0), 5)
     speed = fixed(min(float(planar.max()), 0.5), 4)
     torque = fixed(min(float(np.abs(trajectory.tau).max()), 2.0), 5)
-    for after in np.flatnonzero(np.diff(trajectory.phase)) + 1:
-        sides = [after - 1, after]
+    for last in np.flatnonzero(np.diff(trajectory.phase)):
+        # A replay has a rest of no duration, without forces, before torques that step.
+        after = np.searchsorted(trajectory.t, trajectory.t[last + 1], side="right") - 1
+        sides = [last, after]
         forces = [
             f"{name}: {show(before, force)} \u2192 {show(later, force)}"
             for name, before, later in zip(trajectory.contacts, *trajectory.c_n[sides], strict=True)
@@ -139,7 +141,7 @@ def list_joints(trajectory: Trajectory) -> Table:
         x, _, phi = trajectory.q[after]
         place = trajectory.t[after], x, phi
         torques = trajectory.tau[sides].T.ravel()
-        number = trajectory.phase[after - 1] + 1
+        number = trajectory.phase[last] + 1
         rows.append((number, ", ".join(forces), *place, *planar[sides], *torques))
     heads = ["after phase:d", "c_n before \u2192 after [N]", "t [s]:.6f", "x [mm]:z.3f"]
     heads += ["phi [deg]:z.3f", f"speed before [m/s]:{speed}", f"after:{speed}"]
