@@ -33,6 +33,7 @@ from .edge_plans import (
     Lost,
     PartPlan,
     RoutePart,
+    free_landings,
     list_printed,
     look_ahead,
     plan_coarsely,
@@ -271,6 +272,7 @@ class RoutePlanner:
     jobs: int = 1  # most processes at the same time
     spent: float = 0.0  # [s]: estimated least time to the goals before
     first_only: bool = False  # whether any plan will do: then edges are not refined
+    thorough: bool = False  # whether all guesses are tried for edges through cells
     found: list[Route] = field(default_factory=list)  # their edges through cells have plans
     made: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
@@ -296,10 +298,24 @@ class RoutePlanner:
             # Without a route by then, the other rule leads elsewhere, and as far.
             self.look_by(CAREFUL if self.found else CAREFUL._replace(most=EAGER.most))
             self.plan()
-            if len(self.made) >= self.wanted or len(self.failures) == failed:
+            if len(self.made) >= self.wanted:
                 return
+            if len(self.failures) == failed:
+                if self.made or self.thorough or self.first_only or not self._measurements:
+                    return
+                self._forget_failures()
             # A route without a plan bounds nothing.
             self.search.limit = math.inf
+
+    def _forget_failures(self) -> None:
+        """Have edges without a plan planned again, from further guesses.
+
+        Case: query 207, where a release has a plan from the friction homotopy alone.
+        """
+        self.thorough, plans = True, self.roadmap.coarse_plans
+        for edge in [edge for edge, made in plans.items() if not made]:
+            del plans[edge]
+        self.search.found.clear()
 
     def plan(self) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
@@ -362,6 +378,10 @@ class RoutePlanner:
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, self.report)
+            if isinstance(plan, Lost) and (freed := free_landings(printed, plan.phases)):
+                # Case: phase 3 of query 19, whose coarse plan lands where no accurate one does.
+                other = plan_phases(freed, self.options, self.roadmap.plans, self.report)
+                plan = other if isinstance(other, Plan) else plan
             if isinstance(plan, Plan):
                 break
             if isinstance(plan, Lost) and alike:
@@ -468,7 +488,7 @@ class RoutePlanner:
         self._measurements += len(new)
         if new:
             self.report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
-        plan = partial(plan_coarsely, self.free, options=self.options)
+        plan = partial(plan_coarsely, self.free, options=self.options, thorough=self.thorough)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
         for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []

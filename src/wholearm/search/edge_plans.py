@@ -85,6 +85,7 @@ def plan_coarsely(
     straight: bool = True,
     first_only: bool = False,
     stopped: CoarsePlan | None = None,
+    thorough: bool = False,
 ) -> CoarsePlan | None:
     """Plan an edge through a cell alone, on few intervals; None if there is no plan.
 
@@ -94,6 +95,7 @@ def plan_coarsely(
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried; otherwise all those of a single phase are
     stopped     a plan that stops where it leaves the border, as guess of one that does not
+    thorough    whether all guesses of several phases are tried, too
     """
     from ..planning.time_domain.time_plan import try_phases
 
@@ -120,7 +122,7 @@ def plan_coarsely(
             if before is None:
                 return None
             given = [*before, *stopped.begun]
-        further = alone and not first_only
+        further = (alone or thorough) and not first_only
         plans = try_phases(single, phases, z, rough, towards, further, first_only, given)
     except (WholearmError, np.linalg.LinAlgError):
         return None
@@ -268,6 +270,18 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     name, digits = ("x", length) if x > length * phi else ("phi", 1.0)
     value = _round(float(z[ROWS[name]]), PINNED * digits)
     return replace(phase, until=replace(until, pins=((name, value),)))
+
+
+def free_landings(problem: Problem, numbers: Sequence[int]) -> Problem | None:
+    """The problem where landings of phases, by their numbers, end anywhere; None without any.
+
+    The last phase has to end at the goal.
+    """
+    phases = list(problem.phases)
+    for k, phase in enumerate(phases[:-1]):
+        if phase.number in numbers and phase.until.contact and phase.until.pins:
+            phases[k] = replace(phase, until=replace(phase.until, pins=()), guess=None)
+    return replace(problem, phases=tuple(phases)) if phases != [*problem.phases] else None
 
 
 def _aim(phase: Phase, z: Array, edge: Edge) -> Phase:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, groupby, pairwise
+from itertools import combinations, groupby, islice, pairwise
 from operator import attrgetter, truediv
 from typing import Any, NamedTuple
 
@@ -241,12 +241,13 @@ class Guesses:
         pairs = zip(margins, outlines, strict=True)
         return sorted(((margin, path) for margin, path in pairs if margin), key=rank)
 
-    def to_others(self) -> Iterator[Guess]:
-        """Along the first of these paths, and along the one with the largest margin."""
+    def to_others(self, least: float = -math.inf) -> Iterator[Guess]:
+        """Along the first of these paths, and the one of the largest margin, with margins above."""
         name = "a motion straight to another end"
         best = int(np.argmax([margin.value for margin, _ in self.paths] or [0.0]))
         # No plan is found from the first of them in scene 327 of the stress study, seed 1128.
-        others = [path for k, path in enumerate(self.paths) if k < 3 or k == best]
+        pairs = enumerate(self.paths)
+        others = [path for k, path in pairs if (k < 3 or k == best) and path[0].value > least]
         return (self._follow(name, outline) for _, outline in others)
 
     def _is_planar(self) -> bool:
@@ -283,6 +284,9 @@ class Guesses:
         if straight is not None:
             yield straight
         yield self.nearest
+        if given:
+            # Case: phase 5 of the route of query 172, which has a plan from there alone.
+            yield from islice(self.to_others(SURE), 1)
         # Case: phases 5 and 6 of `heptagon.toml` with friction 0.06.
         name = "a motion that releases a contact earlier"
         yield from (Guess(name, stages) for stages in release_earlier(self.nearest.stages))
