@@ -47,7 +47,7 @@ from wholearm.planning.nlp import Solver
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
-from wholearm.verification.newton_euler import locate
+from wholearm.verification.newton_euler import balance, locate
 from wholearm.viewer.movie import FRAMES, write_movie
 from wholearm.viewer.page import build_page, describe_motion, write_chart, write_player
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
@@ -127,10 +127,8 @@ def check_layout(figure: Figure, least: float = 8.0) -> None:
 def test_figure_has_a_strip_of_one_scale_and_two_panels_with_units(figure: Figure) -> None:
     *strip, margins, torques = figure.axes
     assert len(strip) == 6
-    assert "[N]" in margins.get_ylabel()
-    assert "[N m]" in torques.get_ylabel()
-    assert "[s]" in torques.get_xlabel()
-    assert margins.get_xlim() == torques.get_xlim()
+    assert "[N]" in margins.get_ylabel() and "[N m]" in torques.get_ylabel()
+    assert "[s]" in torques.get_xlabel() and margins.get_xlim() == torques.get_xlim()
     figure.canvas.draw()
     scales = []
     for axes in strip:
@@ -750,8 +748,7 @@ NOT_IN_0_1_0 = tuple(
 
 def two_phases(path: Path = HEPTAGON) -> Problem:
     """The first two phases of a problem, the last one ending at rest."""
-    whole = problem_of(path)
-    first, second = whole.phases[:2]
+    first, second = (whole := problem_of(path)).phases[:2]
     return replace(whole, phases=(first, replace(second, end=whole.phases[-1].end)))
 
 
@@ -763,8 +760,7 @@ def made() -> Plan:
 @pytest.fixture(scope="module")
 def within() -> Plan:
     """A plan in the time domain."""
-    whole = two_phases()
-    first = replace(whole, phases=whole.phases[:1])
+    first = replace(two_phases(), phases=two_phases().phases[:1])
     return solve(first, transcription="time", time_intervals=4, certify=True)
 
 
@@ -788,10 +784,14 @@ def test_a_plan_comes_back_from_its_file(
     loaded = load_plan(tmp_path / "a.npz")
     for name in "options status value phases transitions timings versions certificate".split():
         assert getattr(loaded, name) == getattr(plan, name), name
-    assert loaded.replay == plan.replay
-    assert loaded.meta == plan.meta == write_meta(loaded)
+    assert loaded.replay == plan.replay and loaded.meta == plan.meta == write_meta(loaded)
     assert loaded.problem.table == plan.problem.table
     np.testing.assert_array_equal(loaded.trajectory.tau, plan.trajectory.tau)
+    for phase, motion in zip(plan.problem.phases, loaded.trajectory.motions, strict=True):
+        rows, formation = motion.evaluate(np.linspace(0.0, motion.duration, 98)), phase.formation
+        contacts = sorted(formation.contacts, key=lambda own: motion.contacts.index(own.name))
+        left = balance(formation.scene, contacts, formation.rolling, rows)
+        assert np.abs(left.forces[1:-1]).max() < 1e-9
 
 
 def test_a_plan_says_what_it_is(made: Plan) -> None:
@@ -805,11 +805,14 @@ def test_a_plan_says_what_it_is(made: Plan) -> None:
     assert report.ok and made.replay is not None
     arrivals = [phase.arrival for phase in made.replay.phases]
     assert arrivals == pytest.approx([phase.arrival for phase in report.phases])
+    forces, torque = [phase.least_force for phase in report.phases], made.trajectory.torque
+    assert made.trajectory.least_forces == [(f.least, f.contact) for f in forces if f]
+    dense = np.abs(torque.at(np.linspace(0.0, made.duration, 9999))).max()
+    assert max(made.trajectory.largest_torques) == pytest.approx(dense, rel=1e-3)
 
 
 def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
-    path = change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0)
-    loaded = load_plan(path)
+    loaded = load_plan(change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0))
     assert loaded.value == made.value and loaded.phases[0].duration == made.phases[0].duration
     assert loaded.options == PlanOptions("effort", intervals=20, time_weight=2.0, replay=False)
     assert loaded.replay is None and loaded.transitions == ()
@@ -840,8 +843,7 @@ def test_a_certificate_has_every_phase_and_all_together(certified: Plan) -> None
 def test_an_accuracy_that_is_not_reached_is_said(certified: Plan, error: float, said: bool) -> None:
     """Where the error as it is printed, to one digit, is larger."""
     phases = tuple(own._replace(error=error) for own in certified.phases)
-    options = replace(certified.options, accuracy=1e-4)
-    plan = replace(certified, phases=phases, options=options)
+    plan = replace(certified, phases=phases, options=replace(certified.options, accuracy=1e-4))
     last = describe_plan(plan, "a.npz").to_text().splitlines()[-1]
     assert f"(to {error:.0e}" in last
     assert ("; accuracy 0.0001 not reached)" in last) == said

@@ -304,15 +304,16 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
 
 
 @pytest.mark.parametrize("motors", [{"actuator_lag": 2e-3}, {"torque_rate_limit": 500.0}])
-def test_limited_torques_change_into_a_dwell_and_out_of_it(
-    heptagon: Problem, motors: dict[str, float]
-) -> None:
-    problem = heptagon.with_(motors | {"settle": 0.01})
+def test_limited_torques_change_into_dwells(heptagon: Problem, motors: dict[str, float]) -> None:
+    problem = heptagon.with_(motors | {"settle": 0.01, "speed_limit": 50.0})
     plan = solve(problem, intervals=40)
     torque, starts = plan.trajectory.torque, plan.trajectory.phase_starts
     # Neither steps, rates nor commands beyond the limits, and the replay reaches the goal.
-    assert describe_motors(problem, torque) == [] and verify(problem, plan).ok
+    assert describe_motors(problem, torque) == []
     assert f"{0.02 / plan.value:.1%} of the motion's {plan.value:.6f} s; torq" in plan.to_text()
+    report = verify(problem, plan)
+    held = [own.wedged for own in plan.phases] + [own.wedged for own in report.phases]
+    assert report.ok and max(time or 0.0 for time in held) < 1e-4
     # Each phase ends with the torques of its dwell, for as long as that lasts.
     for phase, end in zip(plan.phases, starts[1:], strict=True):
         assert phase.settling is not None and phase.settling.duration == 0.01

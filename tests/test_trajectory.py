@@ -46,9 +46,8 @@ MOTIONS = (
 
 @pytest.fixture
 def trajectory() -> Trajectory:
-    torque = TorqueProfile(
-        np.array([0.0, 0.7, 0.9]), np.random.default_rng(0).uniform(-1, 1, (2, 2, 4))
-    )
+    ends = [motion.evaluate(np.array([0.0, motion.duration])).tau for motion in MOTIONS]
+    torque = TorqueProfile.join_rows(np.column_stack([[0.0, 0.7, 0.7, 0.9], np.vstack(ends)]))
     return assemble(MOTIONS, torque, {"status": "solved", "epsilon": 0.05}, samples=9)
 
 
@@ -123,9 +122,8 @@ def test_loaded_motions_reproduce_quintics(trajectory: Trajectory, tmp_path: Pat
         t = np.linspace(0, known.duration, 101)
         found, wanted = motion.evaluate(t), known.evaluate(t)
         # Second derivatives divide rounding by the square of the step, 1/40 s.
-        errors = (1e-14, 1e-12, 1e-10, 1e-14)
-        for value, exact, error in zip(found[:4], wanted[:4], errors, strict=True):
-            np.testing.assert_allclose(value, exact, atol=error)
+        for k, error in enumerate((1e-14, 1e-12, 1e-10, 1e-14)):
+            np.testing.assert_allclose(found[k], wanted[k], atol=error)
         order = [known.contacts.index(name) for name in motion.contacts]
         np.testing.assert_allclose(found.c_n, wanted.c_n[:, order], atol=1e-13)
         np.testing.assert_allclose(found.c_t, wanted.c_t[:, order], atol=1e-13)

@@ -9,8 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 
-import numpy as np
-
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, JammingError, SimulationError, name_source
 from ..common.files import require_ending
@@ -154,7 +152,7 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
             require_made_for(problem, meta)
         simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
         simulations = simulations if isinstance(simulations, int) else None
-    one, two = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2)).tolist()
+    one, two = torque.peaks.max(axis=0).tolist()
     numbers = torque.duration, torque.integrate_squares(), (one, two), simulations
     contender = Contender(name, False, "", *numbers, problem=problem, planned=planned)
     try:

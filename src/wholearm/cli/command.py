@@ -643,8 +643,10 @@ def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.
     problem = read_own_problem(trajectory.meta)
     if simulator == "free":
         show_progress("simulating the whole")
-        return wholearm.simulate_free(problem, trajectory).show(trajectory.contacts)
-    return wholearm.simulate(problem, trajectory.torque, progress=show_progress)
+        free = wholearm.simulate_free(problem, trajectory, times=trajectory.t)
+        return free.show(trajectory.contacts)
+    torque, t = trajectory.torque, trajectory.t
+    return wholearm.simulate(problem, torque, times=t, progress=show_progress)
 
 
 def _predict(options: argparse.Namespace) -> int:

@@ -166,7 +166,7 @@ class Planner:
         except WholearmError as error:
             return describe_failure(error)
         limit, share = find_limit(plan)
-        margin = float(np.nanmin(plan.trajectory.c_n)) - plan.problem.epsilon
+        margin = min(plan.trajectory.least_forces)[0] - plan.problem.epsilon
         row = {"status": "planned", "value": plan.value, "margin": margin}
         row |= {"limit": limit, "share": share}
         row |= {f"duration{phase.number}": phase.duration for phase in plan.phases}
@@ -178,11 +178,14 @@ def find_limit(plan: Plan) -> tuple[str, float]:
 
     Instead of epsilon counts the plan's least normal force, which is more for the objective margin.
     """
-    motion, spent = plan.trajectory, dict[str, float]()
+    motion = plan.trajectory
+    least, contact = min(motion.least_forces)
+    # That force may be least for an instant between samples.
+    spent = {f"c_n of {contact}": 0.0}
     weight = (np.diff(motion.t, prepend=0.0) + np.diff(motion.t, append=motion.t[-1])) / 2
     for phase in plan.problem.phases:
         rows, formation = motion.phase == phase.index, phase.formation
-        limits = make_limits(formation, float(np.nanmin(motion.c_n)))
+        limits = make_limits(formation, least)
         columns = [motion.contacts.index(name) for name in formation.names]
         c_t = motion.c_t[rows][:, columns][:, formation.rolling_rows]
         forces = [motion.c_n[rows][:, columns], c_t, motion.tau[rows], motion.theta_dot[rows]]
@@ -282,7 +285,7 @@ class Sweep(Result):
         names = {"problem": "problem"} if len(self.problems) > 1 else {}
         names |= {name: f"{title}:.6g" for name, title in self.titles.items()}
         columns = names | {"status": "status", "value": f"{self.label}:.6g"}
-        columns |= {"phases": "phases [s]:.4g", "margin": "margin [N]:.3g"}
+        columns |= {"phases": "phases [s]:.4g", "margin": "c_n beyond epsilon [N]:.3g"}
         columns |= dict(zip(self.checks, self.checks, strict=True))
         columns |= {"reason": "limited by, or reason", "change": "feasible with"}
         rows, reasons, best = list[list[Any]](), self.reasons, self.best

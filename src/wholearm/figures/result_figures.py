@@ -400,6 +400,8 @@ def draw_sensitivities(result: Sensitivities) -> Figure:
     high, left = 0.24 * len(rows), 0.4 + 0.075 * max(map(len, titles), default=0)
     with style.open_figure(style.WIDTH, high + 1.1) as figure:
         axes = style.inset(figure, left, 0.6, style.WIDTH - left - 2.2, high)
+        # Lines at the outermost ends of bars need a margin, which bars without a width take away.
+        axes.use_sticky_edges = False
         worth = 0.01 * np.array([[row.given * slope for slope in row.phases] for row in rows])
         for k, (part, bars) in enumerate(zip(result.parts, worth.T, strict=True)):
             before = np.where(worth[:, :k] * bars[:, None] > 0, worth[:, :k], 0.0).sum(axis=1)
@@ -411,8 +413,8 @@ def draw_sensitivities(result: Sensitivities) -> Figure:
             axes.text(1.02, k, text, transform=axes.get_yaxis_transform(), va="center", fontsize=8)
         axes.axvline(0.0, color=style.INK, linewidth=0.8)
         axes.set_yticks(count, titles)
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.set_xlabel(f"1 % more changes the {result.objective} [{result.unit}]; line: in all")
+        label = f"1 % more changes the {result.objective} [{result.unit}]; line: in all"
+        axes.set(ylim=(len(rows) - 0.4, -0.6), xlabel=label)
         axes.legend(loc="lower right", fontsize=8)
         style.write_title(figure, result.document.head)
         return figure

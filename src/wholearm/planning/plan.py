@@ -259,7 +259,10 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
             place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
             text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        uniqueness.append((margin, find_wedged(problem, phase, trajectory, EXACT_REST)))
+        # Torques may change at rest before the motion begins.
+        begin = trajectory.phase_starts[phase.index]
+        begin += getattr(trajectory.motions[phase.index], "begin", 0.0)
+        uniqueness.append((margin, find_wedged(problem, phase, trajectory, EXACT_REST, begin)))
     return uniqueness
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import reduce
 from operator import add
@@ -18,6 +18,7 @@ from ..common.errors import InputError, name_source
 from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import read_own_problem
 from ..results.dwell_record import Settling
+from ..results.planned_motion import PlannedMotion
 from ..results.report import Certificate, RangeFigures, ReplayFigures, Transition, UniquenessMargin
 from ..results.trajectory import ModeSpan, Samples, Trajectory, load_trajectory
 from .nlp import SolverStatistics
@@ -242,6 +243,9 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         replay = {key: value for key, value in replay.items() if key != "refinements"}
     figures = restore(ReplayFigures | None, replay)
     timings = Timings(*(float(spent.get(name, 0.0)) for name in Timings._fields))
+    modes = (phase.modes for phase in phases)
+    parts = zip(trajectory.motions, problem.phases, modes, strict=True)
+    trajectory = replace(trajectory, motions=tuple(PlannedMotion.of(*part) for part in parts))
     plan = problem, options, status, float(meta["value"]), trajectory, phases, transitions, figures
     certificate = restore(Certificate | None, meta.get("certificate"))
     ranges = restore(RangeFigures | None, meta.get("ranges"))
@@ -284,11 +288,9 @@ def _list_phases(plan: Plan) -> Table:
     forces = fixed(plan.problem.epsilon or 0.05, 5)
     torques = fixed(float(plan.problem.scene.torque_limit.max()), 7)
     rows = []
-    for index, phase in enumerate(plan.phases):
-        mask = plan.trajectory.phase == index
-        c_n = plan.trajectory.c_n[mask]
-        torque = abs(plan.trajectory.tau[mask]).max()
-        rows.append((phase.number, phase.duration, c_n[c_n == c_n].min(), torque))
+    least, most = plan.trajectory.least_forces, plan.trajectory.largest_torques
+    for phase, (c_n, _), torque in zip(plan.phases, least, most, strict=True):
+        rows.append((phase.number, phase.duration, c_n, torque))
     heads = ["phase:d", "duration [s]:.6f", f"least c_n [N]:{forces}"]
     return Table([*heads, f"largest |tau| [N m]:{torques}"], rows)
 

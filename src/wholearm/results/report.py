@@ -440,7 +440,7 @@ class RangeFigures(NamedTuple):
 
 
 class LeastForce(NamedTuple):
-    """The least normal force of a replay [N]: of which contact, in which phase, and when [s]."""
+    """A least normal force [N]: of which contact, in which phase, and when [s]."""
 
     value: float
     contact: str
@@ -464,6 +464,7 @@ class ReplayedPhase(NamedTuple):
     # end_deviation, deviation: from the plan, at the end of the phase and at worst
     end_deviation: RecordedDeviation | None
     deviation: RecordedDeviation | None
+    least_c_n: LeastForce | None = None  # none in files of earlier versions
 
 
 class ReplayFigures(NamedTuple):

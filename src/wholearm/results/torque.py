@@ -61,6 +61,11 @@ class TorqueProfile:
         return np.asarray(self.coefficients @ powers.T)
 
     @property
+    def peaks(self) -> Array:
+        """The largest size of the torques in each piece, at 17 places of it, (k, 2) [N m]."""
+        return np.asarray(np.abs(self.at_places(_PLACES)).max(axis=2))
+
+    @property
     def jumps(self) -> Array:
         """By how much the torques step at each break but the ends, shape (k - 1, 2) [N m]."""
         signs = (-1.0) ** np.arange(self.coefficients.shape[2])
@@ -213,7 +218,7 @@ def place_rows(
     `error`, relative to the largest torque, is what the lines may miss. They keep a rate limit,
     (2,) [N m/s], if the torques do.
     """
-    peak, breaks = np.abs(torque.at_places(_PLACES)).max(axis=(0, 2)), torque.breaks
+    peak, breaks = torque.peaks.max(axis=0), torque.breaks
     largest = float(peak.max())
     if largest == 0.0:
         return np.column_stack([breaks[[0, -1]], np.zeros((2, 2))])

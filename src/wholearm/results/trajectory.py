@@ -90,8 +90,8 @@ class Trajectory(Drawn):
     c_t: Array
     phase: Numbers  # (n,): index of the phase, from 0
     torque: TorqueProfile  # exact between samples, with every step at a break
-    # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant;
-    # those of a loaded one interpolate the samples.
+    # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant,
+    # those of a loaded plan with z and z' as interpolated; all others interpolate the samples.
     motions: tuple[Motion, ...]
     meta: Mapping[str, Any]  # status, epsilon, the problem, and of a plan all else that it says
 
@@ -134,6 +134,31 @@ class Trajectory(Drawn):
                 rows = (passed >= mode["start"]) & (passed <= mode["stop"])
                 mask[rows] |= [mode["contacts"].get(name) == "rolls" for name in self.contacts]
         return mask
+
+    @property
+    def least_forces(self) -> list[tuple[float, str]]:
+        """The least c_n [N] of each phase and its contact: in a plan's replay, else at the samples.
+
+        NaN and no contact where no forces are known.
+        """
+        found = []
+        for index in range(len(self.motions)):
+            c_n = self.c_n[self.phase == index]
+            least = int(np.where(np.isnan(c_n), np.inf, c_n).argmin())
+            value = float(c_n.flat[least])
+            found.append((value, self.contacts[least % c_n.shape[1]] if value == value else ""))
+        for index, phase in enumerate((self.meta.get("replay") or {}).get("phases", ())):
+            if known := phase.get("least_c_n"):
+                found[index] = known["value"], known["contact"]
+        return found
+
+    @property
+    def largest_torques(self) -> list[float]:
+        """The largest torque of a joint in each phase [N m], between samples, too."""
+        breaks = self.torque.breaks
+        owner = np.searchsorted(self.phase_starts[1:-1], (breaks[1:] + breaks[:-1]) / 2)
+        peaks = self.torque.peaks.max(axis=1)
+        return [float(peaks[owner == index].max()) for index in range(len(self.motions))]
 
     def at(self, t: ArrayLike) -> Samples:
         """The motion at some times, shape (n,) or a number [s], each field of shape (n, ...).
@@ -202,11 +227,12 @@ class Trajectory(Drawn):
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """A phase known by its samples: quintic in time for z, linear for tau and forces."""
+    """A phase known by its torques and samples: quintic in time for z, linear for forces."""
 
     t: Array
     contacts: tuple[str, ...]
     samples: Samples
+    torque: TorqueProfile  # of the whole trajectory
 
     @property
     def duration(self) -> float:
@@ -215,13 +241,20 @@ class SampledMotion:
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        grid, samples = self.t - self.t[0], self.samples
-        k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
-        h, run = grid[k + 1] - grid[k], np.asarray(t) - grid[k]
+        samples, k = self.samples, self.locate(t)
+        h, run = self.t[k + 1] - self.t[k], np.asarray(t) - (self.t[k] - self.t[0])
         z, z_dot, z_ddot = interpolate_quintic(h, run, samples[:3], k)
-        x = (run / h)[:, None]
-        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (samples.tau, samples.c_n, samples.c_t)]
-        return Samples(z, z_dot, z_ddot, *forces)
+        x, (first, last) = (run / h)[:, None], self.t[[0, -1]]
+        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (samples.c_n, samples.c_t)]
+        # Breaks at both ends of the phase are off by rounding.
+        hair = 8 * np.spacing(last)
+        tau = self.torque.at(np.clip(first + np.asarray(t), first + hair, last - hair))
+        return Samples(z, z_dot, z_ddot, tau, *forces)
+
+    def locate(self, t: Array) -> Numbers:
+        """The sample before each of the times `t` from the start of the phase."""
+        k = np.searchsorted(self.t - self.t[0], t, side="right") - 1
+        return np.clip(k, 0, len(self.t) - 2)
 
 
 def interpolate_quintic(
@@ -252,7 +285,7 @@ def interpolate_quintic(
 
 
 def sample_phases(
-    t: Array, phase: Numbers, samples: Samples, contacts: tuple[str, ...]
+    t: Array, phase: Numbers, samples: Samples, contacts: tuple[str, ...], torque: TorqueProfile
 ) -> tuple[SampledMotion, ...]:
     """The motion of each phase, from all samples of a trajectory."""
     motions = []
@@ -261,7 +294,7 @@ def sample_phases(
         parts = [values[rows] for values in samples]
         held = ~np.isnan(parts[4]).all(axis=0)
         own = Samples(*parts[:4], *(forces[:, held] for forces in parts[4:]))
-        motions.append(SampledMotion(t[rows], tuple(compress(contacts, held)), own))
+        motions.append(SampledMotion(t[rows], tuple(compress(contacts, held)), own, torque))
     return tuple(motions)
 
 
@@ -310,7 +343,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     pairs = ((arrays[f"q{dots}"], arrays[f"theta{dots}"]) for dots in ("", "_dot", "_ddot"))
     samples = Samples(*map(np.hstack, pairs), *(arrays[name] for name in ("tau", "c_n", "c_t")))
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
-    motions = sample_phases(arrays["t"], arrays["phase"], samples, contacts)
+    motions = sample_phases(arrays["t"], arrays["phase"], samples, contacts, torque)
     columns = samples._asdict() | {"t": arrays["t"], "phase": arrays["phase"]}
     return Trajectory(**columns, contacts=contacts, torque=torque, motions=motions, meta=meta)
 

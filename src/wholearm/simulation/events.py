@@ -180,7 +180,7 @@ class Simulation(Drawn):
         rows = np.concatenate(chosen)
         t, phases = self.t[rows], self.phase[rows]
         samples = Samples(*(getattr(self, name)[rows] for name in Samples._fields))
-        motions = sample_phases(t, phases, samples, self.contacts)
+        motions = sample_phases(t, phases, samples, self.contacts, self.torque)
         rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
         meta = {
             "status": "replayed",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ..common.arrays import Array, Numbers, find_lowest
+from ..common.arrays import Array, Numbers, find_lowest, sort_unique
 from ..common.errors import InputError
 from ..common.fields import POSITIVE, declare, key, read_keys
 from ..common.sharing import exclusive
@@ -257,11 +257,9 @@ def _report_phase(
     slips = _find_least(simulation, index, margins, EventKind.SLIP)
     end = worst = held = least = None
     if uniqueness:
-        # Since the last break of the torques before it starts to move, if it does.
+        # Since it starts to move, if it does.
         starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
-        breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
-        since = max(breaks, default=-math.inf)
-        held = find_wedged(problem, phase, simulation, REST_SPEED, since)
+        held = find_wedged(problem, phase, simulation, REST_SPEED, *starts[:1])
         least = find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
         end, worst = _compare(simulation, plan, phase, bool(arrivals))
@@ -568,8 +566,7 @@ def find_wedged(
     Parameters
     ----------
     slow         speed that passes for rest, relative to the scene's
-    start : [s]  since when the phase is to move, if its rows begin with the time for which it is
-                 held
+    start : [s]  since when the phase is to move: it may be at rest before while torques change
     """
     scene, contacts = problem.scene, phase.formation.contacts
     rows = np.flatnonzero(motion.phase == phase.index)
@@ -580,7 +577,9 @@ def find_wedged(
     touching = Formation(scene, tuple(dict.fromkeys(contacts)))
     static = Statics(touching, motion.z[rows[0]]).torque_polygon()
     start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
-    t = np.linspace(start, stop, 4 * PLACES)
+    breaks = motion.torque.breaks
+    inner = breaks[(breaks > start) & (breaks < stop)]
+    t = sort_unique(np.concatenate([np.linspace(start, stop, 4 * PLACES), inner]))
     # At its end the torques are those of the next phase.
     beyond = static.measure(motion.torque.at(t[:-1])) - SURE * scene.scales.torque
     free = np.flatnonzero(beyond > 0)
@@ -589,7 +588,8 @@ def find_wedged(
     if free[0] == 0:
         return 0.0
     before, after = beyond[free[0] - 1], beyond[free[0]]
-    held = float((free[0] - after / (after - before)) * (t[1] - t[0]))
+    since, until = t[free[0] - 1 : free[0] + 1] - start
+    held = float(until - after / (after - before) * (until - since))
     return held if held > SETTLING * scene.scales.time else 0.0
 
 

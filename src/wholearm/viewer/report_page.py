@@ -108,16 +108,11 @@ def _describe(contender: Contender, most: int) -> list[str]:
 def list_phases(problem: Problem, trajectory: Trajectory) -> Table:
     """A row for each phase that the motion enters."""
     rows = []
-    for index in np.unique(trajectory.phase):
-        phase, in_phase = problem.phases[index], trajectory.phase == index
-        t, c_n = trajectory.t[in_phase], trajectory.c_n[in_phase]
-        least, name = math.nan, ""
-        if np.isfinite(c_n).any():
-            least = float(np.nanmin(c_n))
-            name = trajectory.contacts[int(np.nanargmin(c_n)) % c_n.shape[1]]
+    for index, least in enumerate(trajectory.least_forces):
+        phase, t = problem.phases[index], trajectory.t[trajectory.phase == index]
         contacts = " ".join(contact.name for contact in phase.formation.contacts)
         text = contacts, str(phase.until), phase.end.value
-        rows.append((index + 1, *text, t[-1] - t[0], least, name))
+        rows.append((index + 1, *text, t[-1] - t[0], *least))
     force = fixed(problem.epsilon or 0.05)
     heads = ["phase:d", "contacts", "until", "end", "duration [s]:.6f", f"least c_n [N]:{force}"]
     return Table([*heads, "of"], rows)

@@ -103,7 +103,7 @@ class Grid(NamedTuple):
             b = np.where(far < first, first * (far / first) ** (4 / 3), far)
             sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
         # The two ends are no unknowns.
-        return np.maximum(sizes, np.finfo(float).tiny)
+        return np.pad(sizes[1:-1], 1, "edge")
 
     def lean(self, by: float) -> Array:
         """The nodes, those at the ends of elements moved inwards a little [m]."""
