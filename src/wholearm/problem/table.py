@@ -40,6 +40,7 @@ def change_table(
     key leads through something that is no table.
     """
     changed: dict[str, Any] = copy.deepcopy(dict(table))
+    owners = dict[str, str]()  # name that changes each key
     for name, value in changes.items():
         dotted = "." in name or "[" in name
         if not dotted and name not in names:
@@ -47,12 +48,16 @@ def change_table(
             raise InputError("", name, f"unknown name; {suggest(name, names)}{allowed}")
         whole = name == "friction" and isinstance(value, Mapping)
         for key in (name,) if dotted or whole else names[name]:
+            if (other := owners.setdefault(key, name)) != name:
+                raise InputError("", name, f"changes the same number as {other} does; give one")
             _set(changed, key, plain(value, finite=False))
     return changed
 
 
 def _set(table: dict[str, Any], key: str, value: object) -> None:
     """Set a dotted key; None removes it."""
+    if _STEP.sub("", key).strip("."):
+        raise InputError("", key, "is no key such as phases[2].until; entries count from 1")
     steps = [word or int(number) - 1 for word, number in _STEP.findall(key)]
     place: Any = table
     for step in steps[:-1]:

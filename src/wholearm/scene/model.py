@@ -103,7 +103,7 @@ def _read_corners(given: object, key: str) -> Array:
         raise InputError("", key, f"{given!r} is not a list of 3 or more points")
     if not 3 <= len(given) <= 500:
         raise InputError("", key, f"{len(given)} corners given; allowed are 3 to 500")
-    return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
+    return frozen([POINT.read(point, f"{key}[{k + 1}]") for k, point in enumerate(given)])
 
 
 CORNERS = FieldKind(
@@ -167,7 +167,7 @@ class Polygon:
         reflex = np.flatnonzero(turns <= 1e-9 * area)
         if reflex.size:
             text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
-            key = f"object.vertices[{reflex[0]}]"
+            key = f"object.vertices[{reflex[0] + 1}]"
             raise InputError("", key, f"{text}every corner must turn left")
         shortest, slender, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
         k = int(lengths.argmin())
@@ -176,7 +176,7 @@ class Polygon:
                 f"allowed are {shortest * size:.3g} m and more, {shortest:g} of the polygon's size"
             )
             text = f"the edge from there has {lengths[k]:.3g} m; {text}"
-            raise InputError("", f"object.vertices[{k}]", text)
+            raise InputError("", f"object.vertices[{k + 1}]", text)
         away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
         width = float(away.max(axis=1).min())
         if width < slender * size:

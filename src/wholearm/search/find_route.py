@@ -89,8 +89,9 @@ def find_route(
     InfeasibleError  if nothing leads to a goal; names what blocks the way
     SolverError      if the time is over before there is a plan; names what is missing
     """
-    if jobs < 1:
-        raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
+    for name, number, least in (("jobs", jobs, 1), ("alternatives", alternatives, 0)):
+        if not isinstance(number, int) or number < least:
+            raise InputError("", name, f"{number!r} given; allowed is an integer from {least} up")
     plan_options = PlanOptions(objective=objective, **options)
     with interruptible(), limited(time_limit):
         report = Reporter(progress)
