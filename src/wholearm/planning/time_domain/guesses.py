@@ -284,14 +284,14 @@ class Guesses:
         if straight is not None:
             yield straight
         yield self.nearest
-        if given:
-            # Case: phase 5 of the route of query 172, which has a plan from there alone.
-            yield from islice(self.to_others(SURE), 1)
         # Case: phases 5 and 6 of `heptagon.toml` with friction 0.06.
         name = "a motion that releases a contact earlier"
         yield from (Guess(name, stages) for stages in release_earlier(self.nearest.stages))
         yield self.nearest.by_homotopy()
-        if not given:
+        if given:
+            # Case: phase 5 of the route of query 172, which has a plan from there alone.
+            yield from islice(self.to_others(SURE), 1)
+        else:
             yield from self.to_others()
             yield Guess(LONGER, self._guess(falls=2 * FALLS))
 
