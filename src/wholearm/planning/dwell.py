@@ -188,12 +188,10 @@ def settle_plans(problem: Problem, plans: Plans) -> Plans:
         times = [problem.settles(phase) or 0.0 for phase in problem.phases]
         ends = find_ends(problem, places, times)
     held, whole = hold_plans(problem, plans, ends), sum(plan.motion.duration for plan in plans)
-    for k, (phase, end) in enumerate(zip(problem.phases, ends, strict=True)):
-        if end is not None:
-            settling = _describe(problem, phase, end)
-            share = settling.duration / whole
-            held[k] = held[k]._replace(settling=settling._replace(share=share))
-    return held
+    return [
+        plan if end is None else plan._replace(settling=_describe(problem, phase, end, whole))
+        for plan, phase, end in zip(held, problem.phases, ends, strict=True)
+    ]
 
 
 def find_ends(
@@ -232,14 +230,15 @@ def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) 
     return held
 
 
-def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
+def _describe(problem: Problem, phase: Phase, end: DwellEnd, whole: float) -> Settling:
+    """How the end of a phase is held, of a motion that lasts `whole` without dwells [s]."""
     place, time, hold, firm = end
     if hold is None:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
         return Settling(phase.number, 0.0, (0.0, 0.0), 0.0, warning=warning)
     (first, second), tau = hold.tau.tolist(), hold.tau[None, :, None]
-    settling = Settling(phase.number, time, (first, second), hold.margin)
+    settling = Settling(phase.number, time, (first, second), hold.margin, share=time / whole)
     opening = find_opening(place)
     if opening is None or place.gained is None:
         return settling

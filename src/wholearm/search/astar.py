@@ -301,21 +301,26 @@ class RoutePlanner:
             if len(self.made) >= self.wanted:
                 return
             if len(self.failures) == failed:
-                if self.made or self.thorough or self.first_only or not self._measurements:
+                if self.made or self.thorough or self.first_only or not self._forget_failures():
                     return
-                self._forget_failures()
             # A route without a plan bounds nothing.
             self.search.limit = math.inf
 
-    def _forget_failures(self) -> None:
-        """Have edges without a plan planned again, from further guesses.
+    def _forget_failures(self) -> bool:
+        """Have edges of several phases without a plan planned from all guesses, if there are any.
 
         Case: query 207, where a release has a plan from the friction homotopy alone.
         """
         self.thorough, plans = True, self.roadmap.coarse_plans
-        for edge in [edge for edge, made in plans.items() if not made]:
+        # For a phase alone, as after a stop, they have been tried.
+        counts = (
+            (e, made, len(e.steps) - (e.steps[0].end is End.REST)) for e, made in plans.items()
+        )
+        lost = [edge for edge, made, count in counts if not made and count > 1]
+        for edge in lost:
             del plans[edge]
         self.search.found.clear()
+        return bool(lost)
 
     def plan(self) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""

@@ -8,7 +8,7 @@ With torques alone a phase ends where its `until` is reached, and with a policy 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -76,13 +76,12 @@ def verify_free(
         progress("simulating the whole")
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings, beyond = warn("whole", whole), [text for _, text in describe_motors(problem, torque)]
-    most = MISSED if plan is None else allowed
-    beyond += [text for own in problem.phases for text in describe_misses(own, whole, most)]
     if plan is None:
         phases, failures = _follow(whole, allowed)
-        warnings = [*beyond, *warnings]
+        warnings = [*beyond, *_list_misses(whole, phases, MISSED), *warnings]
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
-    failures, alone = beyond, []
+    by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
+    failures, alone = [*beyond, *_list_misses(whole, by_clock, allowed)], []
     for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
@@ -95,7 +94,6 @@ def verify_free(
             if end.measure(problem.scene.scales.length) > allowed:
                 away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
                 failures.append(f"{title} ends {away}")
-    by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
     both = tuple(alone), tuple(by_clock)
     return FreeReport(problem.name, whole, *both, tuple(failures), tuple(warnings))
 
@@ -144,10 +142,10 @@ def verify_policy(
         stop = loop.began.get(number + 1, ends)
         touch = find_touch(whole, list_gained(problem, phase), start)
         losses = tuple(find_losses(whole, phase, start, min(stop, touch), allowed, moment))
-        warnings += describe_misses(phase, whole, MISSED, (start, stop))
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))
+        warnings += _list_misses(whole, phases[-1:], MISSED)
         lasting = [loss for loss in losses if loss.closes > start + moment]
         failures += [loss.describe(number) for loss in lasting]
         warnings += [
@@ -216,6 +214,15 @@ def measure_end(simulation: Simulation, plan: Trajectory, index: int, stop: floa
     row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
     away = np.abs(simulation.z[row] - plan.z[np.flatnonzero(plan.phase == index)[-1]])
     return Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
+
+
+def _list_misses(simulation: Simulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:
+    """Limits that phases exceed between their start and stop, as of `describe_misses`."""
+    own = simulation.problem.phases
+    spans = ((own[phase.number - 1], (phase.start, phase.stop)) for phase in phases)
+    return [
+        text for phase, span in spans for text in describe_misses(phase, simulation, allowed, span)
+    ]
 
 
 def _follow(simulation: Simulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
