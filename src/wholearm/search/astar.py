@@ -35,6 +35,7 @@ from .edge_plans import (
     RoutePart,
     free_landings,
     list_printed,
+    list_slow,
     look_ahead,
     plan_coarsely,
     plan_part,
@@ -383,10 +384,13 @@ class RoutePlanner:
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, self.report)
-            if isinstance(plan, Lost) and (freed := free_landings(printed, plan.phases)):
-                # Case: phase 3 of query 19, whose coarse plan lands where no accurate one does.
+            lost = plan.phases if isinstance(plan, Lost) else ()
+            if isinstance(plan, Plan) and alike:
+                lost = list_slow(plan, found)
+            if freed := free_landings(printed, lost):
                 other = plan_phases(freed, self.options, self.roadmap.plans, self.report)
-                plan = other if isinstance(other, Plan) else plan
+                plans = [made for made in (plan, other) if isinstance(made, Plan)]
+                plan = min(plans, key=lambda made: made.value, default=plan)
             if isinstance(plan, Plan):
                 break
             if isinstance(plan, Lost) and alike:

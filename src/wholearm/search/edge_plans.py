@@ -51,6 +51,7 @@ OFF = 1e-4  # distance of a traced end from a border's end that makes it another
 GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the duration
 SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
 POSES = 10  # least number of them, as intervals of a first guess
+SLOW = 1.1  # ratio of durations to the coarse plan's that shows another local optimum; query 19
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
 
 
@@ -282,6 +283,20 @@ def free_landings(problem: Problem, numbers: Sequence[int]) -> Problem | None:
         if phase.number in numbers and phase.until.contact and phase.until.pins:
             phases[k] = replace(phase, until=replace(phase.until, pins=()), guess=None)
     return replace(problem, phases=tuple(phases)) if phases != [*problem.phases] else None
+
+
+def list_slow(plan: Plan, planned: PartPlan) -> list[int]:
+    """Numbers of a plan's phases that take far longer than the coarse plans that they begin from.
+
+    Case: phase 3 of query 19, whose plan from the coarse one's landing takes 0.28 s, or is none by
+    rounding; with a free landing it takes 0.17 s.
+    """
+    pairs = zip(plan.phases[-len(planned) :], planned, strict=True)
+    return [
+        phase.number
+        for phase, (_, motion) in pairs
+        if motion and phase.value > SLOW * motion.duration
+    ]
 
 
 def _aim(phase: Phase, z: Array, edge: Edge) -> Phase:
