@@ -70,11 +70,6 @@ class PhaseData(NamedTuple):
         """Torque limits, shape (2,) [N m]."""
         return self.limits.high[self.limits.of(TORQUE)]
 
-    @property
-    def spans(self) -> Array:
-        """Scale of each side of the limits, shape (n_sides,)."""
-        return self.limits.side_scales
-
     def find_terms(self) -> Array:
         """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
         return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
