@@ -345,17 +345,10 @@ def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
     if runs_along_curves(block, options) or not following:
         return None
     phase, ending = following[0], block[-1]
-    until = ending.until.contact
     gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    if (
-        options.goal is Objective.MARGIN
-        or until is None
-        or ending.until.pins
-        or gained != {until}
-        or not runs_along_curves(following, options)
-    ):
+    lands = gained == {ending.until.contact} and not ending.until.pins
+    if options.goal is Objective.MARGIN or not lands or not runs_along_curves(following, options):
         return None
-
     if options.goal is Objective.TIME and len(following) == 1:
         return estimate_time_to_go(phase, problem.epsilon)
 

@@ -33,8 +33,7 @@ _KEYS = {
     "build_time": "build_times", "solve_time": "solve_times",
 }  # fmt: skip
 """What `meta` calls fields of phases and of their statistics; others have the same name there."""
-_OPTIONS = [option.name for option in fields(PlanOptions)]
-_OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
+_OPTIONS = [o.name for o in fields(PlanOptions) if o.name not in ("objective", "replay", "ranges")]
 """Options that stand in `meta` by themselves."""
 
 
@@ -416,16 +415,13 @@ def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
 
 def _describe_uniqueness(plan: Plan) -> str:
     """Uniqueness margin of contact forces, and for how long phases are possibly stuck."""
-    margins = [
-        (phase.uniqueness_margin, phase.number) for phase in plan.phases if phase.uniqueness_margin
-    ]
+    margins = [(p.uniqueness_margin, p.number) for p in plan.phases if p.uniqueness_margin]
     if not margins:
         return ""
     least, number = min(margins)
     text = f"contact forces unique: margin {least.value:.2f} (1 without friction, 0 ambiguous)"
-    wedged = [
-        f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
-        for phase in plan.phases
-        if phase.wedged
-    ]
-    return "".join([text, f", least in phase {number}", *wedged])
+    text += f", least in phase {number}"
+    for phase in plan.phases:
+        if phase.wedged:
+            text += f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
+    return text
