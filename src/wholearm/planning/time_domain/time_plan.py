@@ -623,20 +623,17 @@ def plan_with_impacts(
     z: Array,
     options: PlanOptions,
     duration: float | None,
-    ample: float = math.inf,
-    fastest: Sequence[PhasePlan[Motion]] = (),
-    free: Sequence[PhasePlan[Motion]] = (),
-    **others: Any,
+    **given: Any,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
-    The arguments are those of `plan_phases`, and `others` of it for a block without impacts.
+    The arguments are those of `plan_phases`; with impacts `ample`, `fastest` and `free` count.
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        others |= {"ample": ample, "fastest": fastest, "free": free}
-        return [*plan_phases(problem, block, z, options, duration, **others)]
-    direct = partial(plan_part, problem, block, ample=ample, free=free)
+        return [*plan_phases(problem, block, z, options, duration, **given)]
+    fastest: Sequence[PhasePlan[Motion]] = given["fastest"]
+    direct = partial(plan_part, problem, block, ample=given["ample"], free=given["free"])
     thorough = partial(direct, thorough=True)
     with_stops = partial(plan_stops, thorough, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
