@@ -1,8 +1,5 @@
 """Plans of all blocks of a problem, one after the other, in the path or the time domain.
 
-Phases joined smoothly or by impacts are one block. Blocks of phases with one degree of freedom are
-planned along their curves, all others in the time domain.
-
 Along curves the velocity at the end of a phase is z_s s'. An impact makes it a multiple of the next
 curve's tangent at any speed: v+ = ratio s' z_s. So whether it is possible is known before planning,
 and with a parameter that runs `ratio` times as fast on the next curve the speed is continuous: the
@@ -103,9 +100,9 @@ class Planning:
     @cached_property
     def trajectory(self) -> Trajectory:
         """The motion with dwells; of its `meta` only rolling contacts and modes."""
-        formations = [phase.formation for phase in self.problem.phases]
-        motions, torques = zip(*((plan.motion, plan.torque) for plan in self.settled), strict=True)
-        return assemble_motions(motions, torques, formations, self.options.samples)
+        pairs = zip(self.settled, self.problem.phases, strict=True)
+        pieces = ((plan.motion, plan.torque, phase.formation) for plan, phase in pairs)
+        return assemble_motions(pieces, self.options.samples)
 
     def allow(self, phases: Sequence[Phase]) -> float | None:
         """Longest duration of some phases in all [s], for the objective `margin`."""

@@ -1,17 +1,9 @@
 """Torques at ends at rest: changes between phases under rate limits and lag, and dwells.
 
-**Changes.** A motion along a curve starts and ends with torques at the limit of static equilibrium:
-without acceleration, with the friction of its directions. There the internal force is free, so
-these torques are a line for each of two phases that meet. The pair that is the nearest in time is
-taken, and torques change linearly between them in a pause, while everything rests. The former also
-have to hold the object in the next formation; then so do all in between, as balanced forces within
-their cones are a convex set. A plan in the time domain begins and ends with the torques of its
-motion; a pause changes the torques before it.
-
-**Dwells.** Constant torques hold the ends of phases until contacts are closed. A phase that stops
-short of the contact to be gained leaves the next one in another formation. Torques that press all
-contacts together (`simulation.modes`) close it first; how soon depends on impacts, which
-are simulated without assumptions on contacts.
+Equations and rules are in the README. Torques that change in a pause hold the object throughout if
+the first and the last ones do, as balanced forces within their cones are a convex set. Dwells press
+all contacts together (`simulation.modes`); how soon they close depends on impacts, which are
+simulated without assumptions on contacts.
 """
 
 from __future__ import annotations

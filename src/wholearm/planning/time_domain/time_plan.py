@@ -1,10 +1,8 @@
 """Plans of phases in the time domain by direct collocation, from a list of initial guesses.
 
-Phases joined in motion are one NLP, first solved on few intervals from each guess in turn. A
-solution in whose contact modes nothing is left to gain is refined at once; otherwise it is compared
-with the one by friction homotopy, so that a plan does not depend on the guess alone. The better one
-goes through the mode search and the refinement. Where no guess leads to a plan, the elastic problem
-(least violation of limits) gives another guess, or the reason.
+Phases joined in motion are one NLP, first solved on few intervals from each guess in turn, then by
+mode search and refinement; the README says which guesses are compared. Where none leads to a plan,
+the elastic problem (least violation of limits) gives another guess, or the reason.
 """
 
 from __future__ import annotations
@@ -179,12 +177,12 @@ def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -
     if search.to_go is not None:
         with suppress(WholearmError):
             search = replace(search, price=search.expand(last.guess.nodes[-1, 0])[1])
-    stages, solution = drop_stops(guess.stages), None
+    stages = drop_stops(guess.stages)
     if search.source.scene.has_slow_motors:
         solution = reach_motors(search, stages)
+        stages = solution.stages
     if search.source.scene.control_period:
-        solution = hold_torques(search, solution.stages if solution else stages)
-    assert solution is not None
+        solution = hold_torques(search, stages)
     return solution._replace(attempt=guess.name)
 
 
