@@ -213,9 +213,8 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         places = [
             LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}") for t, z in nodes
         ]
-        shortfalls += find_shortfalls(
-            part.limits, part.evaluate(part.nodes, motion.profile), places
-        )
+        values = part.evaluate(part.nodes, motion.profile)
+        shortfalls += find_shortfalls(part.limits, values, places)
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
