@@ -43,10 +43,10 @@ from ..simulation.modes import (
 )
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
-from .options import Objective, PlanOptions
+from .options import PlanOptions
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
-from .phase_plan import PhasePlan, Plans, end_of
+from .phase_plan import PhasePlan, Plans, combine, end_of, value_of
 
 
 class Junction(NamedTuple):
@@ -129,12 +129,8 @@ def add_pause(
         return plan
     z = plan.motion.evaluate(np.zeros(1)).z[0]
     forces = Statics(formation, z).find_firmest_forces(change.before)
-    effort = change.torque.integrate_squares() + options.time_weight * change.duration
-    value = {
-        Objective.TIME: plan.value + change.duration,
-        Objective.EFFORT: plan.value + effort,
-        Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
-    }[options.goal]
+    pause = value_of(options, change.duration, change.torque, float(forces[0].min()))
+    value = combine(options.goal, [plan.value, pause])
     return _pause(plan, change, forces)._replace(value=value)
 
 

@@ -231,7 +231,7 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
 
     with suppress(SolverError):  # it stalls
         for part, motion in zip(parts, elastic.motions, strict=True):
-            pieces.append((motion, fit_torque(part, motion)[0], part.curve.formation))
+            pieces.append((motion, fit_torque(part, motion), part.curve.formation))
         missing = assemble_motions(pieces, 201, status="misses limits least")
     error = rank(task.phases, shortfalls, missing)
     return advise(error, may_change, list_values, partial(_replan_task, task))

@@ -58,6 +58,13 @@ def combine(goal: Objective, values: Sequence[float]) -> float:
     return min(values) if goal is Objective.MARGIN else sum(values)
 
 
+def value_of(options: PlanOptions, duration: float, torque: TorqueProfile, least: float) -> float:
+    """The objective of a motion: its duration [s], its effort, or its least normal force [N]."""
+    if options.goal is Objective.EFFORT:
+        return torque.integrate_squares() + options.time_weight * duration
+    return least if options.goal is Objective.MARGIN else duration
+
+
 Piece = tuple[Motion, TorqueProfile, Formation]
 """A phase: its motion, its torque from its start, and its formation."""
 

@@ -214,8 +214,8 @@ def choose_sampling(nodes: int) -> Sampling:
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
 
 
-def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
+def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
+    """Torque of a motion, one polynomial in time per interval.
 
     Through the knots, or through Chebyshev points in time if that misses the torque between them.
     SolverError if the motion all but stops in an interval.
@@ -233,7 +233,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
         torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
-    return torque, torque.integrate_squares()
+    return torque
 
 
 def find_torques(

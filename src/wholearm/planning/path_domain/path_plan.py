@@ -32,7 +32,7 @@ from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
-from ..phase_plan import PhasePlan, share_duration
+from ..phase_plan import PhasePlan, share_duration, value_of
 from ..refinement import SOLVES, refine
 from ..robust.robust_rows import Guide, RobustLimits, list_holds, measure_holds, spread
 from .path_data import PhaseData, find_torques, fit_torque, join, prepare
@@ -648,14 +648,10 @@ class PathIterate:
     @cached_property
     def plans(self) -> Plans:
         """The plan of each phase; SolverError if one nearly stops between two nodes."""
-        options, plans = self.task.options, []
+        plans, least = [], self.task.epsilon + self.margin
         for part, motion in zip(self.parts, self.motions, strict=True):
-            torque, squares = fit_torque(part, motion)
-            value = {
-                Objective.TIME: motion.duration,
-                Objective.EFFORT: squares + options.time_weight * motion.duration,
-                Objective.MARGIN: self.task.epsilon + self.margin,
-            }[options.goal]
+            torque = fit_torque(part, motion)
+            value = value_of(self.task.options, motion.duration, torque, least)
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
 

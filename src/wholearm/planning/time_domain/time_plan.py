@@ -44,7 +44,7 @@ from ..explain import (
     require_hold_at_ends,
 )
 from ..options import Objective, PlanOptions
-from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops
+from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops, value_of
 from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
@@ -60,7 +60,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, resample, to_si, unit_of
+from .stage import Scheme, Stage, resample, to_si
 from .time_motion import TimeMotion, make_phase_motions
 
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
@@ -597,17 +597,12 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
 
 def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase."""
-    problem, plans = search.source, list[PhasePlan[TimeMotion]]()
-    scales, first = problem.scene.scales, search.tried
+    problem, plans, first = search.source, list[PhasePlan[TimeMotion]](), search.tried
+    least = problem.epsilon + problem.scene.scales.force * solution.margin
     stages = [to_si(stage, problem) for stage in solution.stages]
     motions = make_phase_motions(stages, search.scheme)
     for phase, motion in zip(search.phases, motions, strict=True):
-        value = motion.duration
-        if search.goal is Objective.MARGIN:
-            value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
-        elif search.goal is Objective.EFFORT:
-            squares = motion.torque.integrate_squares()
-            value = search.options.time_weight * motion.duration + squares
+        value = value_of(search.options, motion.duration, motion.torque, least)
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
