@@ -35,7 +35,7 @@ from ..results.trajectory import Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.path_plan import Pins, Task, plan_curves
+from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import (
     PER_SPEED,
     Plans,
@@ -457,15 +457,11 @@ class ImpactSequence:
         return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
     def make_task(
-        self,
-        epsilon: float,
-        options: PlanOptions,
-        duration: float | None = None,
-        pins: Pins = (None, None),
+        self, epsilon: float, options: PlanOptions, duration: float | None = None
     ) -> Task:
         """Phases that possible impacts join, from rest to rest."""
         numbers = [phase.number for phase in self.phases]
-        return Task(self.continuous_curves, epsilon, options, numbers, duration, pins=pins)
+        return Task(self.continuous_curves, epsilon, options, numbers, duration)
 
     def estimate(self, epsilon: float) -> float:
         """Estimated least time [s], with stops where impacts are not possible."""
@@ -521,8 +517,9 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
         duration = planning.allow(part.phases)
         if duration is not None and junction is not None:
             duration -= junction.change.duration
+        task = replace(part.make_task(epsilon, options, duration), pins=pins)
         with charge(number):
-            plan: Plans = [*plan_curves(part.make_task(epsilon, options, duration, pins))]
+            plan: Plans = [*plan_curves(task)]
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)
         plans += plan
