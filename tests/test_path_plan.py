@@ -30,7 +30,6 @@ from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, inverse
 from wholearm.mechanics.speed_sweep import NoMotionError
-from wholearm.planning import lower_bound
 from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
 from wholearm.planning.options import Objective, PlanOptions
@@ -507,9 +506,7 @@ def test_the_bound_shares_nothing_with_the_nlp() -> None:
             assert [alias.name for alias in node.names] == ["numpy"]
 
 
-def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid() -> None:
     """A flip after a slide, until an edge is flush on finger 2, is slowest where a joint turns."""
     # Some of the grids are too coarse there for any motion, others for more than a crawl.
     text = """
@@ -533,8 +530,7 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     problem, least = read_lines(text), []
     curves, epsilon = trace_phases(problem)[1:], problem.epsilon
     for intervals in (50, 100):
-        monkeypatch.setattr(lower_bound, "GRID_INTERVALS", intervals)
-        found = bound_least_time(curves, epsilon)
+        found = bound_least_time(curves, epsilon, intervals)
         assert found is not None
         least.append(found.value)
     assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)

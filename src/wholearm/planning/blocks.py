@@ -1,8 +1,5 @@
 """Plans of all blocks of a problem, one after the other, in the path or the time domain.
 
-Phases joined smoothly or by impacts are one block. Blocks of phases with one degree of freedom are
-planned along their curves, all others in the time domain.
-
 Along curves the velocity at the end of a phase is z_s s'. An impact makes it a multiple of the next
 curve's tangent at any speed: v+ = ratio s' z_s. So whether it is possible is known before planning,
 and with a parameter that runs `ratio` times as fast on the next curve the speed is continuous: the
@@ -38,7 +35,7 @@ from ..results.trajectory import Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.path_plan import Pins, Task, plan_curves
+from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import (
     PER_SPEED,
     Plans,
@@ -103,9 +100,9 @@ class Planning:
     @cached_property
     def trajectory(self) -> Trajectory:
         """The motion with dwells; of its `meta` only rolling contacts and modes."""
-        formations = [phase.formation for phase in self.problem.phases]
-        motions, torques = zip(*((plan.motion, plan.torque) for plan in self.settled), strict=True)
-        return assemble_motions(motions, torques, formations, self.options.samples)
+        pairs = zip(self.settled, self.problem.phases, strict=True)
+        pieces = ((plan.motion, plan.torque, phase.formation) for plan, phase in pairs)
+        return assemble_motions(pieces, self.options.samples)
 
     def allow(self, phases: Sequence[Phase]) -> float | None:
         """Longest duration of some phases in all [s], for the objective `margin`."""
@@ -345,17 +342,10 @@ def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
     if runs_along_curves(block, options) or not following:
         return None
     phase, ending = following[0], block[-1]
-    until = ending.until.contact
     gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    if (
-        options.goal is Objective.MARGIN
-        or until is None
-        or ending.until.pins
-        or gained != {until}
-        or not runs_along_curves(following, options)
-    ):
+    lands = gained == {ending.until.contact} and not ending.until.pins
+    if options.goal is Objective.MARGIN or not lands or not runs_along_curves(following, options):
         return None
-
     if options.goal is Objective.TIME and len(following) == 1:
         return estimate_time_to_go(phase, problem.epsilon)
 
@@ -467,15 +457,11 @@ class ImpactSequence:
         return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
 
     def make_task(
-        self,
-        epsilon: float,
-        options: PlanOptions,
-        duration: float | None = None,
-        pins: Pins = (None, None),
+        self, epsilon: float, options: PlanOptions, duration: float | None = None
     ) -> Task:
         """Phases that possible impacts join, from rest to rest."""
         numbers = [phase.number for phase in self.phases]
-        return Task(self.continuous_curves, epsilon, options, numbers, duration, pins=pins)
+        return Task(self.continuous_curves, epsilon, options, numbers, duration)
 
     def estimate(self, epsilon: float) -> float:
         """Estimated least time [s], with stops where impacts are not possible."""
@@ -531,8 +517,9 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
         duration = planning.allow(part.phases)
         if duration is not None and junction is not None:
             duration -= junction.change.duration
+        task = replace(part.make_task(epsilon, options, duration), pins=pins)
         with charge(number):
-            plan: Plans = [*plan_curves(part.make_task(epsilon, options, duration, pins))]
+            plan: Plans = [*plan_curves(task)]
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)
         plans += plan

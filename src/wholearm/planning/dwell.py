@@ -1,17 +1,9 @@
 """Torques at ends at rest: changes between phases under rate limits and lag, and dwells.
 
-**Changes.** A motion along a curve starts and ends with torques at the limit of static equilibrium:
-without acceleration, with the friction of its directions. There the internal force is free, so
-these torques are a line for each of two phases that meet. The pair that is the nearest in time is
-taken, and torques change linearly between them in a pause, while everything rests. The former also
-have to hold the object in the next formation; then so do all in between, as balanced forces within
-their cones are a convex set. A plan in the time domain begins and ends with the torques of its
-motion; a pause changes the torques before it.
-
-**Dwells.** Constant torques hold the ends of phases until contacts are closed. A phase that stops
-short of the contact to be gained leaves the next one in another formation. Torques that press all
-contacts together (`simulation.modes`) close it first; how soon depends on impacts, which
-are simulated without assumptions on contacts.
+Equations and rules are in the README. Torques that change in a pause hold the object throughout if
+the first and the last ones do, as balanced forces within their cones are a convex set. Dwells press
+all contacts together (`simulation.modes`); how soon they close depends on impacts, which are
+simulated without assumptions on contacts.
 """
 
 from __future__ import annotations
@@ -51,10 +43,10 @@ from ..simulation.modes import (
 )
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
-from .options import Objective, PlanOptions
+from .options import PlanOptions
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
-from .phase_plan import PhasePlan, Plans, end_of
+from .phase_plan import PhasePlan, Plans, combine, end_of, value_of
 
 
 class Junction(NamedTuple):
@@ -137,12 +129,8 @@ def add_pause(
         return plan
     z = plan.motion.evaluate(np.zeros(1)).z[0]
     forces = Statics(formation, z).find_firmest_forces(change.before)
-    effort = change.torque.integrate_squares() + options.time_weight * change.duration
-    value = {
-        Objective.TIME: plan.value + change.duration,
-        Objective.EFFORT: plan.value + effort,
-        Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
-    }[options.goal]
+    pause = value_of(options, change.duration, change.torque, float(forces[0].min()))
+    value = combine(options.goal, [plan.value, pause])
     return _pause(plan, change, forces)._replace(value=value)
 
 

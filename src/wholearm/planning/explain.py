@@ -40,7 +40,6 @@ from ..geometry.path_guess import count_freedoms
 from ..mechanics.limits import EPSILON, PRESS, LimitSet, make_limits
 from ..mechanics.statics import Statics, pushes_one_way
 from ..problem.definition import Phase, Problem
-from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
@@ -48,7 +47,7 @@ from .nlp import open_ledger, setting
 from .options import PlanOptions
 from .path_domain.path_data import fit_torque
 from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
-from .phase_plan import Plans, assemble_motions, runs_along_curves
+from .phase_plan import Piece, Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
 from .time_domain.stage import Stage, blend, make_formation, to_si
@@ -207,16 +206,15 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     except SolverError:
         return SolverError(stopped)
     data, parts = elastic.data, elastic.parts
-    torques, shortfalls, missing = list[TorqueProfile](), list[Shortfall](), None
+    pieces, shortfalls, missing = list[Piece](), list[Shortfall](), None
     for part, motion, phase in zip(parts, elastic.motions, task.phases, strict=True):
         suffix = f", phase {phase}" if len(parts) > 1 else ""
         nodes = zip(motion.times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
         places = [
             LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}") for t, z in nodes
         ]
-        shortfalls += find_shortfalls(
-            part.limits, part.evaluate(part.nodes, motion.profile), places
-        )
+        values = part.evaluate(part.nodes, motion.profile)
+        shortfalls += find_shortfalls(part.limits, values, places)
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
@@ -232,11 +230,9 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         return () if least is None else list_beyond(parameter, least)
 
     with suppress(SolverError):  # it stalls
-        torques = [fit_torque(*pair)[0] for pair in zip(parts, elastic.motions, strict=True)]
-        formations = [part.curve.formation for part in parts]
-        missing = assemble_motions(
-            elastic.motions, torques, formations, 201, status="misses limits least"
-        )
+        for part, motion in zip(parts, elastic.motions, strict=True):
+            pieces.append((motion, fit_torque(part, motion), part.curve.formation))
+        missing = assemble_motions(pieces, 201, status="misses limits least")
     error = rank(task.phases, shortfalls, missing)
     return advise(error, may_change, list_values, partial(_replan_task, task))
 
@@ -512,12 +508,11 @@ def explain_stages(
         unit = _unit_of(parameter, problem.scene.scales)
         return list_beyond(parameter, parameter.value + parameter.sign * unit * solution.cost)
 
-    motions = make_phase_motions(stages, search.scheme)
-    torques = [motion.torque for motion in motions]
-    formations = [phase.formation for phase in phases]
-    motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
+    motions = zip(make_phase_motions(stages, search.scheme), phases, strict=True)
+    pieces = ((motion, motion.torque, phase.formation) for motion, phase in motions)
+    missing = assemble_motions(pieces, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    error = rank(numbers, shortfalls, motion)
+    error = rank(numbers, shortfalls, missing)
     return advise(error, parameters, list_values, replan, ADVICE)
 
 

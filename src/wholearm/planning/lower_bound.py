@@ -32,7 +32,6 @@ from ..mechanics.speed_sweep import (
 )
 
 GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
-GRID_INTERVALS = 100  # of the first grid
 # Intervals on each side of a blocked one that are split, into how many, and how often; case: the
 # border of an octagon's flip, passed at a tenth of the speed beside it.
 _NARROW, _PARTS, _TRIES = 2, 4, 4
@@ -124,7 +123,7 @@ class LowerBound(NamedTuple):
 
 
 def bound_least_time(
-    curves: Sequence[Curve], epsilon: float, intervals: int = GRID_INTERVALS, grids: int = 16
+    curves: Sequence[Curve], epsilon: float, intervals: int = 100, grids: int = 16
 ) -> LowerBound | None:
     """Lower bound of the time along curves; None where no motion is found.
 

@@ -103,16 +103,12 @@ class PlanOptions:
         from ..problem.definition import PARAMETERS, read_widths
 
         factor = self.robust if factor is None else factor
-        ranges = (
-            {key: factor * width for key, width in read_widths(given).items()} if factor else {}
-        )
-        for parameter in PARAMETERS:
-            if not parameter.unit and ranges.get(parameter.name, 0.0) >= 1:
-                text = (
-                    f"{factor:g} makes the range of {parameter.name} "
-                    f"{ranges[parameter.name]:g}; a relative "
-                )
-                raise InputError("", "robust", text + "range is below 1")
+        widths = read_widths(given) if factor else {}
+        ranges = {name: factor * width for name, width in widths.items()}
+        for name in (parameter.name for parameter in PARAMETERS if not parameter.unit):
+            if ranges.get(name, 0.0) >= 1:
+                text = f"{factor:g} makes the range of {name} {ranges[name]:g}"
+                raise InputError("", "robust", f"{text}; a relative range is below 1")
         return replace(self, ranges=ranges)
 
     def roughen(self) -> PlanOptions:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -58,14 +58,20 @@ def combine(goal: Objective, values: Sequence[float]) -> float:
     return min(values) if goal is Objective.MARGIN else sum(values)
 
 
-def assemble_motions(
-    motions: Sequence[Motion],
-    torques: Sequence[TorqueProfile],
-    formations: Sequence[Formation],
-    rows: int,
-    **meta: Any,
-) -> Trajectory:
+def value_of(options: PlanOptions, duration: float, torque: TorqueProfile, least: float) -> float:
+    """The objective of a motion: its duration [s], its effort, or its least normal force [N]."""
+    if options.goal is Objective.EFFORT:
+        return torque.integrate_squares() + options.time_weight * duration
+    return least if options.goal is Objective.MARGIN else duration
+
+
+Piece = tuple[Motion, TorqueProfile, Formation]
+"""A phase: its motion, its torque from its start, and its formation."""
+
+
+def assemble_motions(pieces: Iterable[Piece], rows: int, **meta: Any) -> Trajectory:
     """The trajectory of phases; of its `meta` rolling contacts and modes are added."""
+    motions, torques, formations = zip(*pieces, strict=True)
     entries: dict[str, Any] = {
         "rolling": [[contact.name for contact in formation.rolling] for formation in formations],
         "modes": plain([getattr(motion, "modes", ()) for motion in motions]),

@@ -134,13 +134,8 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         replayed = time.perf_counter()
         transitions = _assess(planning, report)
         assessed = time.perf_counter()
-        ranges = None
-        if options.robust:
-            ranges = assess_ranges(planning, report)
-        certificate = None
-        if options.certify:
-            report("bounding the least time from below")
-            certificate = certify(planning)
+        ranges = assess_ranges(planning, report) if options.robust else None
+        certificate = certify(planning, report) if options.certify else None
         gaps = certificate.gaps if certificate else {}
         phases = tuple(
             PlannedPhase(
@@ -204,11 +199,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = block.chain.list_impacts(block.plans)
             planner = partial(_plan_part, block.chain, planning.problem.epsilon)
         first = block.phases[0].index
-        stops = [
-            0,
-            *(impact.phase - first for impact in impacts if not impact.possible),
-            len(block.phases),
-        ]
+        stops = [0, *(i.phase - first for i in impacts if not i.possible), len(block.phases)]
         for impact in impacts:
             # Torques held over periods start from a plan that stops, which there is not.
             if impact.possible and not planning.problem.scene.control_period:
@@ -266,8 +257,9 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
     return uniqueness
 
 
-def certify(planning: Planning) -> Certificate:
+def certify(planning: Planning, report: Callable[[str], None]) -> Certificate:
     """Bound the least time of every part of a planning that is run through from rest to rest."""
+    report("bounding the least time from below")
     bounds = list[TimeBound]()
     for block in planning.blocks:
         times = [plan.motion.duration for plan in block.plans]

@@ -175,17 +175,14 @@ def _add_loss(planning: Planning, made: Planning, index: int) -> Planning:
 
 def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float:
     """By how much c_n of a block falls short of epsilon in its replay, if only a little [N]."""
-    problem = planning.problem
+    numbers = [phase.number for phase in block.phases]
     phases = check.report.phases if isinstance(check.report, Report) else ()
-    margins = [
-        contact.margin
-        for phase in phases
-        if problem.phases[phase.number - 1] in block.phases
-        for contact in phase.contacts
+    contacts = [
+        contact for phase in phases if phase.number in numbers for contact in phase.contacts
     ]
-    short = -min(margins, default=0.0)
+    short = -min((contact.margin for contact in contacts), default=0.0)
     # Phase 11 of query 72, over time: 2.1e-3, for microseconds where a contact changes its name.
-    return short if 0.0 < short < 4e-3 * problem.scene.scales.force else 0.0
+    return short if 0.0 < short < 4e-3 * planning.problem.scene.scales.force else 0.0
 
 
 def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> ReplayCheck:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import reduce
 from operator import add
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 from numpy.typing import ArrayLike
 
@@ -33,9 +33,10 @@ _KEYS = {
     "build_time": "build_times", "solve_time": "solve_times",
 }  # fmt: skip
 """What `meta` calls fields of phases and of their statistics; others have the same name there."""
-_OPTIONS = [option.name for option in fields(PlanOptions)]
-_OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
+_OPTIONS = [o.name for o in fields(PlanOptions) if o.name not in ("objective", "replay", "ranges")]
 """Options that stand in `meta` by themselves."""
+_PARTS = ("versions", "transitions", "replay", "certificate", "timings", "ranges")
+"""Fields of a plan that have the same name in `meta`."""
 
 
 class Status(Enum):
@@ -84,12 +85,12 @@ class Timings(NamedTuple):
 
     # trace, plan, replay, assess: tracing curves; all up to the first plan; its replay, and other
     # plans of blocks that failed in it (in `plan` where a search has replayed); gains of impacts
-    trace: float
-    build: float  # build, solve: building NLPs and solving them, in all of these
-    solve: float
-    plan: float
-    replay: float
-    assess: float
+    trace: float = 0.0
+    build: float = 0.0  # build, solve: building NLPs and solving them, in all of these
+    solve: float = 0.0
+    plan: float = 0.0
+    replay: float = 0.0
+    assess: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,10 +104,10 @@ class Plan(Drawn, Result):
     # the motion. Its `meta` says the same as the plan in plain values, for files.
     trajectory: Trajectory = field(repr=False)
     phases: tuple[PlannedPhase, ...]
-    transitions: tuple[Transition, ...]  # impacts that the problem asks for
-    replay: ReplayFigures | None  # none if the plan was not replayed
-    timings: Timings
-    versions: Mapping[str, str]  # of this package and those that it plans with
+    transitions: tuple[Transition, ...] = ()  # impacts that the problem asks for
+    replay: ReplayFigures | None = None  # none if the plan was not replayed
+    timings: Timings = field(default_factory=Timings)
+    versions: Mapping[str, str] = field(default_factory=dict)  # of packages that it plans with
     certificate: Certificate | None = None  # lower bounds of the durations, if they were asked for
     ranges: RangeFigures | None = None  # what ranges cost, for a robust plan
 
@@ -187,12 +188,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "epsilon": plan.problem.epsilon,
             **{_KEYS.get(name, name): each for name, each in (of_phases | spent).items()},
             **{name: getattr(options, name) for name in _OPTIONS},
-            "versions": plan.versions,
-            "transitions": plan.transitions,
-            "replay": plan.replay,
-            "certificate": plan.certificate,
-            "timings": plan.timings,
-            "ranges": plan.ranges,
+            **{name: getattr(plan, name) for name in _PARTS},
         }
     )
     return values | {"problem": plan.problem.table}
@@ -236,20 +232,16 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     entries = [pick(_PHASES, k) | {"statistics": pick(_STATISTICS, k)} for k in range(count)]
     numbered = [{"number": number, **entry} for number, entry in enumerate(entries, start=1)]
     phases = restore(tuple[PlannedPhase, ...], numbered)
-    status, replay, spent = Status(meta["status"]), meta.get("replay"), meta.get("timings", {})
-    transitions = restore(tuple[Transition, ...], meta.get("transitions", ()))
-    if replay is not None:
+    kinds, stored = get_type_hints(Plan), {name: meta[name] for name in _PARTS if name in meta}
+    if replay := meta.get("replay"):
         # In earlier versions intervals were doubled for a replay to hold.
-        replay = {key: value for key, value in replay.items() if key != "refinements"}
-    figures = restore(ReplayFigures | None, replay)
-    timings = Timings(*(float(spent.get(name, 0.0)) for name in Timings._fields))
+        stored["replay"] = {key: value for key, value in replay.items() if key != "refinements"}
     modes = (phase.modes for phase in phases)
-    parts = zip(trajectory.motions, problem.phases, modes, strict=True)
-    trajectory = replace(trajectory, motions=tuple(PlannedMotion.of(*part) for part in parts))
-    plan = problem, options, status, float(meta["value"]), trajectory, phases, transitions, figures
-    certificate = restore(Certificate | None, meta.get("certificate"))
-    ranges = restore(RangeFigures | None, meta.get("ranges"))
-    return Plan(*plan, timings, dict(meta.get("versions", {})), certificate, ranges)
+    triples = zip(trajectory.motions, problem.phases, modes, strict=True)
+    trajectory = replace(trajectory, motions=tuple(PlannedMotion.of(*each) for each in triples))
+    status, value = Status(meta["status"]), float(meta["value"])
+    parts = {name: restore(kinds[name], part) for name, part in stored.items()}
+    return Plan(problem, options, status, value, trajectory, phases, **parts)
 
 
 def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None = None) -> Document:
@@ -416,16 +408,13 @@ def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
 
 def _describe_uniqueness(plan: Plan) -> str:
     """Uniqueness margin of contact forces, and for how long phases are possibly stuck."""
-    margins = [
-        (phase.uniqueness_margin, phase.number) for phase in plan.phases if phase.uniqueness_margin
-    ]
+    margins = [(p.uniqueness_margin, p.number) for p in plan.phases if p.uniqueness_margin]
     if not margins:
         return ""
     least, number = min(margins)
     text = f"contact forces unique: margin {least.value:.2f} (1 without friction, 0 ambiguous)"
-    wedged = [
-        f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
-        for phase in plan.phases
-        if phase.wedged
-    ]
-    return "".join([text, f", least in phase {number}", *wedged])
+    text += f", least in phase {number}"
+    for phase in plan.phases:
+        if phase.wedged:
+            text += f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
+    return text

@@ -70,11 +70,6 @@ class PhaseData(NamedTuple):
         """Torque limits, shape (2,) [N m]."""
         return self.limits.high[self.limits.of(TORQUE)]
 
-    @property
-    def spans(self) -> Array:
-        """Scale of each side of the limits, shape (n_sides,)."""
-        return self.limits.side_scales
-
     def find_terms(self) -> Array:
         """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
         return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
@@ -193,10 +188,6 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
 
     Where two meet, as at a reversal, the grid has an interval of length zero.
     """
-    if len(parts) == 1:
-        return parts[0]
-    if any(not np.array_equal(part.limits.rows, parts[0].limits.rows) for part in parts):
-        raise ValueError("phases with different rows of limits cannot be joined")
     grids, start, segment = list[Grid](), 0.0, 0
     for grid in (part.grid for part in parts):
         grids.append(Grid(start + grid.s, segment + grid.segment, grid.maps))
@@ -223,8 +214,8 @@ def choose_sampling(nodes: int) -> Sampling:
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
 
 
-def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
+def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
+    """Torque of a motion, one polynomial in time per interval.
 
     Through the knots, or through Chebyshev points in time if that misses the torque between them.
     SolverError if the motion all but stops in an interval.
@@ -242,7 +233,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
         torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
-    return torque, torque.integrate_squares()
+    return torque
 
 
 def find_torques(

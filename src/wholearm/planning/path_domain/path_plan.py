@@ -1,29 +1,14 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-Direct collocation along the curve, refined in the loop of `refinement`. Elements end where the
-minimum-time profile of a sweep switches from one active limit to another. They are halved while
-violations between nodes cost more than the accuracy. Limits are tightened by their violations until
-none exceeds `MISS`; what that costs is the estimate of the error.
+Direct collocation along the curve, refined in the loop of `refinement`; elements, equations, first
+points and the estimate of the error are in the README. The unknowns a = s'', b = s'^2 and lambda
+are polynomials in the local variable y of an element (`path_motion`).
 
-**NLP.** On a curve z(s) everything is affine in a = s'', b = s'^2 and the internal force lambda,
-but for viscous friction (`PathForces`). Unknowns are a_k, b_k and lambda_k at the nodes s_k of
-elements (`path_motion`). Inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is
-exact,
-
-    b_k+1 = b_k + h sum of links_kj a_j over the nodes j of the element of length h,
-    low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
-    T = sum of h weights_k / sqrt(b_k) (next to rest as in `_find_paces`).
-
-b is continuous where two elements meet; a and lambda may step. Rate-limited torques are continuous:
-d tau / dt = (d tau / dy) (dy / dt) with the local variable y of an element, in which the torques at
-its nodes are a polynomial. The least margin has a copy at every node with m_k+1 = m_k: a dense
-column would make building the Jacobian quadratic in their number. Built once for some contacts,
-intervals and an objective, it serves every phase: grid, coefficients and limits are its parameters
-and bounds.
-
-**First points.** The squared speed b is somewhat below that of the minimum-time speed profile, or a
-parabola in s without one; the internal force is amid its range, and multipliers are those near the
-central path.
+Rate-limited torques are continuous: d tau / dt = (d tau / dy) (dy / dt), the torques at the nodes
+of an element being a polynomial in y. The least margin has a copy at every node with m_k+1 = m_k: a
+dense column would make building the Jacobian quadratic in their number. Built once for some
+contacts, intervals and an objective, the NLP serves every phase: grid, coefficients and limits are
+its parameters and bounds.
 """
 
 from __future__ import annotations
@@ -47,7 +32,7 @@ from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
-from ..phase_plan import PhasePlan, share_duration
+from ..phase_plan import PhasePlan, share_duration, value_of
 from ..refinement import SOLVES, refine
 from ..robust.robust_rows import Guide, RobustLimits, list_holds, measure_holds, spread
 from .path_data import PhaseData, find_torques, fit_torque, join, prepare
@@ -189,17 +174,15 @@ def find_sure_start(
     holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.lam[0]])
     T0, T = forces.of_tau[0, :, ONE], forces.of_tau[0][:, [A, LAMBDA]]
-    unit = formation.scene.scales.torque
-    if measure_holds(holds, T0 + T @ here) > SURE * unit:
+    scales, spans = formation.scene.scales, data.limits.side_scales
+    if measure_holds(holds, T0 + T @ here) > SURE * scales.torque:
         return None
     presses = np.isin(data.limits.sides[0], data.limits.of(PRESS))
-    rows = data.find_limits(data.nodes.pick(slice(0, 1))).rows[0] * data.spans[:, None]
-    slopes = rows[:, [A, LAMBDA]]
-    scales = formation.scene.scales
-    units = np.array([scales.acceleration, scales.force])
+    rows = data.find_limits(data.nodes.pick(slice(0, 1))).rows[0] * spans[:, None]
+    slopes, units = rows[:, [A, LAMBDA]], np.array([scales.acceleration, scales.force])
     # Sides of the torques that can be held, and a distance beyond [N m].
     sides = [
-        (normal * gains, bound + 10.0 * SURE * unit)
+        (normal * gains, bound + 10.0 * SURE * scales.torque)
         for static, gains in holds
         for normal, bound in zip(static.normals, static.bounds, strict=True)
     ]
@@ -217,8 +200,8 @@ def find_sure_start(
             rates, rest = slopes @ along, offsets + slopes @ foot
             crossings = -rest[rates != 0] / rates[rates != 0]
             for place in (foot, *(foot + share * along for share in crossings)):
-                kept = ((offsets + slopes @ place) / data.spans).min() >= -1e-9 and place[0] > 0
-                kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
+                kept = ((offsets + slopes @ place) / spans).min() >= -1e-9 and place[0] > 0
+                kept = kept and measure_holds(holds, T0 + T @ place) > SURE * scales.torque
                 away = float(np.abs(T @ (place - here)).max())
                 if kept and away < best:
                     ends = (place[1], np.inf) if normal[1] > 0 else (-np.inf, place[1])
@@ -267,15 +250,11 @@ class Task:
         breaks, last = breaks or [np.zeros(0)] * len(self.curves), len(self.curves) - 1
         pairs = list(zip(self.curves, breaks, strict=True))
         elements = max(elements or self.elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
-        grids = [
-            make_grid(*pair, elements, (k == 0, k == last), self.is_held)
-            for k, pair in enumerate(pairs)
-        ]
-        columns = zip(self.curves, grids, self.phases, self.spreads, strict=True)
-        return [
-            prepare(curve, self.epsilon, grid, phase, limits)
-            for curve, grid, phase, limits in columns
-        ]
+        parts = list[PhaseData]()
+        for k, (pair, phase) in enumerate(zip(pairs, self.phases, strict=True)):
+            grid = make_grid(*pair, elements, (k == 0, k == last), self.is_held)
+            parts.append(prepare(pair[0], self.epsilon, grid, phase, self.spreads[k]))
+        return parts
 
     def find_fastest(self) -> Fastest | None:
         """The minimum-time speed profile of a sweep; None without one."""
@@ -521,15 +500,14 @@ class PathIterate:
         task, accuracy = self.task, self.task.options.accuracy
         # A first plan that misses much by signs of no row is a reference only; case: two releases
         # of a pentagon, whose plan takes 20 % longer.
-        slack = self.data.slack(self.data.nodes, self.profile, self.margin)
-        references = 6  # most
-        if task.guides and self.meshes < references and (slack / self.data.spans).min() < -0.05:
-            other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
-            return replace(other, meshes=self.meshes + 1)
+        if task.guides and self.meshes < 6:  # most references
+            slack = self.data.slack(self.data.nodes, self.profile, self.margin)
+            if (slack / self.data.limits.side_scales).min() < -0.05:
+                other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
+                return replace(other, meshes=self.meshes + 1)
         # What tightening by the violations will cost, and what it has.
         costs = self.paid + self._price(*map(self.data.spread_to_nodes, self.misses[:2]))
-        shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
-        costly = _GAP * float(costs.sum()) > accuracy
+        shares, costly = self._split(costs), _GAP * float(costs.sum()) > accuracy
         if task.is_held and (self.meshes < 2 or (costly and self.meshes < 4)):
             grow = self.meshes >= 2 and task.options.intervals is None
             count = task.elements * 3 // 2 if grow else task.elements
@@ -586,10 +564,13 @@ class PathIterate:
     @cached_property
     def motions(self) -> list[PathMotion]:
         """The motion of each phase."""
-        ends = np.cumsum([len(part.grid.s) for part in self.parts])[:-1]
-        columns = zip(*(np.split(values, ends) for values in self.profile), strict=True)
-        pairs = zip(self.parts, columns, strict=True)
-        return [PathMotion(part.curve, part.grid, Profile(*each)) for part, each in pairs]
+        profiles = map(Profile, *map(self._split, self.profile))
+        pairs = zip(self.parts, profiles, strict=True)
+        return [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
+
+    def _split(self, values: Array) -> list[Array]:
+        """Values at the nodes of each phase."""
+        return np.split(values, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
 
     @property
     def guides(self) -> tuple[Guide, ...]:
@@ -619,7 +600,7 @@ class PathIterate:
         if any(motion.stalls for motion in self.motions):
             return np.inf
         short, over, late = self.misses
-        most = max((short / self.data.spans).max(), over[:, 0].max(), late)
+        most = max((short / self.data.limits.side_scales).max(), over[:, 0].max(), late)
         return float(max(most / MISS, over[:, 1:].max() / 1e-4))
 
     @property
@@ -667,14 +648,10 @@ class PathIterate:
     @cached_property
     def plans(self) -> Plans:
         """The plan of each phase; SolverError if one nearly stops between two nodes."""
-        options, plans = self.task.options, []
+        plans, least = [], self.task.epsilon + self.margin
         for part, motion in zip(self.parts, self.motions, strict=True):
-            torque, squares = fit_torque(part, motion)
-            value = {
-                Objective.TIME: motion.duration,
-                Objective.EFFORT: squares + options.time_weight * motion.duration,
-                Objective.MARGIN: self.task.epsilon + self.margin,
-            }[options.goal]
+            torque = fit_torque(part, motion)
+            value = value_of(self.task.options, motion.duration, torque, least)
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
 

@@ -1,13 +1,9 @@
 """Robust limits of contact forces along curves: worst case over ranges of uncertain parameters.
 
-With the radius r_p of each range, a force limit h c >= low becomes, at the same s and s' and under
-the same torques,
-
-    h c - sum over p of |d(h c - low)/dp| r_p >= low.
-
-The derivatives times r_p, the parametric bounds, are affine in 1, a = s'', b = s'^2, the internal
-force lambda and s' (`mechanics.sensitivity`). So the left side is the least of affine rows, one for
-each choice of signs. At a place with a known b they allow a polygon of a and lambda; a minimum-time
+In h c - sum over p of |d(h c - low)/dp| r_p >= low (README) the derivatives times r_p, the
+parametric bounds, are affine in 1, a = s'', b = s'^2, the internal force lambda and s'
+(`mechanics.sensitivity`). So the left side is the least of affine rows, one for each choice of
+signs. At a place with a known b they allow a polygon of a and lambda; a minimum-time
 motion is at its vertex of largest or least a. The rows that meet at these two are found by cutting
 planes: the most violated row is added. These `COPIES` rows for each limit are taken like any other
 limits. `PhaseData` evaluates the absolute values, so that tightening covers other signs between.

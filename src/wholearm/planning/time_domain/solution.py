@@ -1,10 +1,7 @@
 """Solution of the time-domain NLP of stages by Ipopt, and its refinement.
 
 Each iterate is checked once: limits at `checks` places of every interval, by the motion that its
-torques lead to. Intervals are halved where the relative cost of missed limits plus the gain of
-torques of any shape, by the minimum principle with the costates of the solution, is above the
-accuracy, or where collocation misses the motion. In the others limits are raised by what is missed.
-The next solve has both, and starts from the last one, until limits hold everywhere.
+torques lead to. The README says where intervals are halved, or limits raised by what is missed.
 """
 
 from __future__ import annotations

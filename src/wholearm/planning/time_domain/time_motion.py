@@ -196,13 +196,10 @@ class TimeMotion:
         """Contact modes of the stages with their times."""
         spans = []
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
-            formation, (Xi, sigma) = stage.formation, stage.directions
-            rolls = formation.rolling_rows
-            slides = ("+" if xi > 0 else "-" for xi in Xi)
-            modes = [ROLLS if k in rolls else sign for k, sign in enumerate(slides)]
-            contacts = dict(zip(formation.names, modes, strict=True))
-            joints = tuple("+" if sign > 0 else "-" for sign in sigma)
-            spans.append(ModeSpan(start, start + stage.duration, contacts, joints))
+            signs = ["+" if sign > 0 else "-" for sign in np.concatenate(stage.directions)]
+            rolls = {contact.name: ROLLS for contact in stage.formation.rolling}
+            contacts = dict(zip(stage.formation.names, signs, strict=False)) | rolls
+            spans.append(ModeSpan(start, start + stage.duration, contacts, tuple(signs[-2:])))
         return tuple(spans)
 
     def evaluate(self, t: Array) -> Samples:

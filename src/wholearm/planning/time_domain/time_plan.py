@@ -1,10 +1,8 @@
 """Plans of phases in the time domain by direct collocation, from a list of initial guesses.
 
-Phases joined in motion are one NLP, first solved on few intervals from each guess in turn. A
-solution in whose contact modes nothing is left to gain is refined at once; otherwise it is compared
-with the one by friction homotopy, so that a plan does not depend on the guess alone. The better one
-goes through the mode search and the refinement. Where no guess leads to a plan, the elastic problem
-(least violation of limits) gives another guess, or the reason.
+Phases joined in motion are one NLP, first solved on few intervals from each guess in turn, then by
+mode search and refinement; the README says which guesses are compared. Where none leads to a plan,
+the elastic problem (least violation of limits) gives another guess, or the reason.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ from ..explain import (
     require_hold_at_ends,
 )
 from ..options import Objective, PlanOptions
-from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops
+from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops, value_of
 from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
@@ -62,7 +60,7 @@ from .mode_search import (
     sign_sequence,
 )
 from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
-from .stage import Scheme, Stage, resample, to_si, unit_of
+from .stage import Scheme, Stage, resample, to_si
 from .time_motion import TimeMotion, make_phase_motions
 
 # Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
@@ -179,12 +177,12 @@ def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -
     if search.to_go is not None:
         with suppress(WholearmError):
             search = replace(search, price=search.expand(last.guess.nodes[-1, 0])[1])
-    stages, solution = drop_stops(guess.stages), None
+    stages = drop_stops(guess.stages)
     if search.source.scene.has_slow_motors:
         solution = reach_motors(search, stages)
+        stages = solution.stages
     if search.source.scene.control_period:
-        solution = hold_torques(search, solution.stages if solution else stages)
-    assert solution is not None
+        solution = hold_torques(search, stages)
     return solution._replace(attempt=guess.name)
 
 
@@ -599,17 +597,12 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
 
 def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase."""
-    problem, plans = search.source, list[PhasePlan[TimeMotion]]()
-    scales, first = problem.scene.scales, search.tried
+    problem, plans, first = search.source, list[PhasePlan[TimeMotion]](), search.tried
+    least = problem.epsilon + problem.scene.scales.force * solution.margin
     stages = [to_si(stage, problem) for stage in solution.stages]
     motions = make_phase_motions(stages, search.scheme)
     for phase, motion in zip(search.phases, motions, strict=True):
-        value = motion.duration
-        if search.goal is Objective.MARGIN:
-            value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
-        elif search.goal is Objective.EFFORT:
-            squares = motion.torque.integrate_squares()
-            value = search.options.time_weight * motion.duration + squares
+        value = value_of(search.options, motion.duration, motion.torque, least)
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
@@ -623,20 +616,17 @@ def plan_with_impacts(
     z: Array,
     options: PlanOptions,
     duration: float | None,
-    ample: float = math.inf,
-    fastest: Sequence[PhasePlan[Motion]] = (),
-    free: Sequence[PhasePlan[Motion]] = (),
-    **others: Any,
+    **given: Any,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
-    The arguments are those of `plan_phases`, and `others` of it for a block without impacts.
+    The arguments are those of `plan_phases`; with impacts `ample`, `fastest` and `free` count.
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        others |= {"ample": ample, "fastest": fastest, "free": free}
-        return [*plan_phases(problem, block, z, options, duration, **others)]
-    direct = partial(plan_part, problem, block, ample=ample, free=free)
+        return [*plan_phases(problem, block, z, options, duration, **given)]
+    fastest: Sequence[PhasePlan[Motion]] = given["fastest"]
+    direct = partial(plan_part, problem, block, ample=given["ample"], free=given["free"])
     thorough = partial(direct, thorough=True)
     with_stops = partial(plan_stops, thorough, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
