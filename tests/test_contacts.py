@@ -306,7 +306,7 @@ def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     scene = plane.make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)
     x, phi = rng.uniform(-0.06, 0.06, 400), rng.uniform(-4, 4, 400)
-    labels = label_cells(scene, x, phi)[:, [0, 2, 4]]
+    labels = label_cells(scene, np.column_stack([x, phi]))
     usable = (labels >= 0).all(axis=1)
     assert usable.mean() > 0.25
     labels, x, phi = labels[usable], x[usable], phi[usable]

@@ -381,7 +381,7 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
         assert np.abs(both.evaluate(z, z).C).max() < 1e-9
     for part in parts:
         middle = (part.start + part.stop) / 2
-        label = label_cells(scene, *middle[:, None])[0]
+        label = label_cells(scene, middle)
         table = contact_table(scene)
         assert part.contacts == tuple(table[i] for i in label if i != NOWHERE)
 
@@ -413,7 +413,7 @@ def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
 def test_a_leg_beside_a_curved_border(heptagon: Problem, bulge: float, crosses: bool) -> None:
     """Where it is less than the tolerance beyond the border, it stays in its cell."""
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
-    on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
+    on_finger_2 = label_cells(scene, np.linspace(*leg, 300))[:, 2]
     assert (np.diff(on_finger_2) != 0).sum() == 2
     parts = split_leg(scene, *leg)
     touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
@@ -625,7 +625,7 @@ def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> Non
 def test_a_place_out_of_reach_changes_nothing_at_others() -> None:
     scene, rng = problem_of(HEPTAGON).scene, np.random.default_rng(1)
     poses = np.column_stack([rng.uniform(-0.1, 0.1, 300), rng.uniform(-4, 4, 300)])
-    labels, runs = label_cells(scene, *poses.T)[:, [0, 2, 4]], rng.normal(size=poses.shape)
+    labels, runs = label_cells(scene, poses), rng.normal(size=poses.shape)
     inside = (labels >= 0).all(axis=1)
     labels, poses, runs = labels[inside], poses[inside], runs[inside] * [0.03, 1.0]
     far = poses + np.array([1.0, 0.0])
