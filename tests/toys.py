@@ -17,7 +17,8 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from wholearm.common.arrays import Array
-from wholearm.geometry.curve import Curve, CurvePoint, Segment
+from wholearm.contacts.formation import CurvePoint
+from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
 from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
@@ -106,9 +107,8 @@ class Toy:
             patch.setattr(path_plan, "find_sure_start", lambda *_: None)
             yield
 
-    def _inverse(
-        self, _: Any, z: Array, z_s: Array, z_ss: Array, directions: Directions, __: Any
-    ) -> PathForces:
+    def _inverse(self, _: Any, point: CurvePoint, directions: Directions) -> PathForces:
+        z = point.z
         C, T = np.zeros((len(z), 1, 5)), np.zeros((len(z), 2, 5))
         C[..., LAMBDA] = 1.0
         # The segment's number stands in for the directions of its joints.

@@ -19,8 +19,8 @@ from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
-from ..contacts.formation import Formation
-from ..geometry.curve import Curve, CurvePoint, border, describe_pose, directions_of, solve_tangent
+from ..contacts.formation import CurvePoint, Formation
+from ..geometry.curve import Curve, border, describe_pose, directions_of, solve_tangent
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
@@ -337,7 +337,7 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         directions = Directions.of(point.kinematics, point.z_s)
     else:
         return None
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
     inertia = reduced_inertia(formation, point.kinematics, directions)
     return PathSamples(phase, curve, s, point, directions, forces, limits, inertia)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -34,6 +34,24 @@ class Kinematics(NamedTuple):
     A_t: Array
     P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
     P_dot_v: Array  # (n, n_c + R): P' v for the velocities v that were given: P z'' = -P' z'
+
+    def pick(self, rows: Any) -> Kinematics:
+        """Those of some of the configurations."""
+        return Kinematics(*(array[rows] for array in self))
+
+
+class CurvePoint(NamedTuple):
+    """Curve at n places: z, tangent z_s and curvature z_ss, (n, 5) each, and kinematics there."""
+
+    z: Array
+    z_s: Array
+    z_ss: Array
+    kinematics: Kinematics
+
+    def pick(self, rows: Any) -> CurvePoint:
+        """Some of the places."""
+        kinematics = self.kinematics.pick(rows)
+        return CurvePoint(self.z[rows], self.z_s[rows], self.z_ss[rows], kinematics)
 
 
 def _identify_limits(formation: Formation) -> Hashable:

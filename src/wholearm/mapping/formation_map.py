@@ -19,7 +19,7 @@ from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_alike
 from ..contacts.elemental import Contact
-from ..contacts.formation import Kinematics
+from ..contacts.formation import CurvePoint, Kinematics
 from ..geometry.curve import solve_tangent
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights, reduced_inertia
@@ -237,23 +237,18 @@ def _check_motions(
     scene = problem.scene
     held, unique = np.zeros((2, *tangents.shape[:2]), dtype=bool)
     for (formation, mine), k in product(group_alike(scene, labels), range(tangents.shape[1])):
-
-        def take(rows: Numbers, k: int = k) -> tuple[Kinematics, Array, Directions]:
-            part = Kinematics(*(array[rows] for array in kinematics))
-            return part, tangents[rows, k], Directions.of(part, tangents[rows, k])
-
-        rows = np.flatnonzero(mine & regular)
-        part, tangent, directions = take(rows)
+        every = CurvePoint(z, tangents[:, k], 0 * z, kinematics)
+        rows, of_all = np.flatnonzero(mine & regular), Directions.of(kinematics, tangents[:, k])
         if formation.n_constraints == 3:
-            wrench = force_rows(formation, part, directions)[:, :, :3]
+            wrench = force_rows(formation, kinematics, of_all)[rows, :, :3]
             rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
-            part, tangent, directions = take(rows)
-        forces = inverse(formation, z[rows], tangent, 0 * tangent, directions, part)
-        limits = InternalForceLimits.of(formation, forces, tangent[:, 3:])
+        point, directions = every.pick(rows), Directions(*(signs[rows] for signs in of_all))
+        forces = inverse(formation, point, directions)
+        limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
         still = np.zeros(len(rows))
         low, high = limits.find_span(still, still, problem.epsilon)
         held[rows, k] = low <= high
-        unique[rows, k] = find_minors(formation, part, directions.Xi).ratios >= limit
+        unique[rows, k] = find_minors(formation, point.kinematics, directions.Xi).ratios >= limit
     return held & unique, np.any(held & ~unique, axis=1)
 
 
@@ -329,12 +324,13 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     # With the share of length as path parameter.
     tangent, curvature = length * z_s, length**2 * z_ss
     for formation, mine in group_alike(scene, labels):
-        kinematics = Kinematics(*(array[mine] for array in at))
+        kinematics = at.pick(mine)
         every_limit = make_limits(formation, problem.epsilon)
         for back, sign in enumerate((1, -1)):
             turned = sign * tangent[mine]
             directions = Directions.of(kinematics, turned)
-            forces = inverse(formation, z[mine], turned, curvature[mine], directions, kinematics)
+            point = CurvePoint(z[mine], turned, curvature[mine], kinematics)
+            forces = inverse(formation, point, directions)
             rows, cap = PathLimits.of(every_limit, forces, turned[:, 3:], GIVE).eliminate()
             inertia = reduced_inertia(formation, kinematics, directions)
             ratios = find_minors(formation, kinematics, directions.Xi).ratios

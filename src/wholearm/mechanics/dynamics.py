@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import CurvePoint, Formation, Kinematics
 from ..scene.model import Scene
 
 Fixed = tuple[tuple[int, float | Array], ...]
@@ -120,22 +120,14 @@ def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Di
         )
 
 
-def inverse(
-    formation: Formation,
-    z: Array,
-    z_s: Array,
-    z_ss: Array,
-    directions: Directions,
-    kinematics: Kinematics | None = None,
-) -> PathForces:
+def inverse(formation: Formation, point: CurvePoint, directions: Directions) -> PathForces:
     """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
     number: the internal force lambda along a unit null vector; three leave none. `directions` are
     signs for motion along +s, in one row or n.
     """
-    scene = formation.scene
-    kinematics = kinematics or formation.evaluate(z, z_s)
+    scene, (z, z_s, z_ss, kinematics) = formation.scene, point
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     mass, count = scene.mass_diagonal, wrench.shape[2]

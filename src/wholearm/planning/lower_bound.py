@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array, Numbers
-from ..geometry.curve import Curve, CurvePoint, directions_of
+from ..contacts.formation import CurvePoint
+from ..geometry.curve import Curve, directions_of
 from ..mechanics.dynamics import ONE, A, B, V, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits, find_range
@@ -111,7 +112,7 @@ class PathTerms:
 
 def find_limits(curve: Curve, epsilon: float, point: CurvePoint, segment: Numbers) -> PathLimits:
     """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
-    forces = inverse(curve.formation, *point[:3], directions_of(curve, segment), point.kinematics)
+    forces = inverse(curve.formation, point, directions_of(curve, segment))
     limits = make_limits(curve.formation, epsilon)
     return PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
 

@@ -72,8 +72,9 @@ def evaluate_paths(
 ) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
     formation, limits = _make_limits(scene, epsilon)
-    z, z_u, z_uu, kinematics = move(scene, labels, poses, runs)
-    directions = Directions.of(kinematics, z_u)
+    point = move(scene, labels, poses, runs)
+    kinematics, rates = point.kinematics, point.z_s
+    directions = Directions.of(kinematics, rates)
     # Rounding makes dependent wrenches independent by a hair (goal 12): a margin tells them.
     wrenches = force_rows(formation, kinematics, directions)[:, :, :3]
     wrenches /= [1.0, 1.0, scene.scales.length]
@@ -81,8 +82,8 @@ def evaluate_paths(
     with np.errstate(invalid="ignore"):
         held = np.asarray(np.abs(np.linalg.det(wrenches)) > 1e-9 * sizes)
     kinematics = kinematics._replace(A=np.where(held[:, None, None], kinematics.A, np.nan))
-    forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
-    rows, cap = PathLimits.of(limits, forces, z_u[:, 3:], GIVE)
+    forces = inverse(formation, point._replace(kinematics=kinematics), directions)
+    rows, cap = PathLimits.of(limits, forces, rates[:, 3:], GIVE)
     # No motion where three contacts cannot balance the object, or a finger cannot reach it.
     held &= np.isfinite(rows).all(axis=(1, 2))
     rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])

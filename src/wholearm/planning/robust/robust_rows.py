@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Numbers
-from ...contacts.formation import Formation
-from ...geometry.curve import Curve, CurvePoint, directions_of
+from ...contacts.formation import CurvePoint, Formation
+from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
@@ -152,7 +152,7 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     segment = np.repeat(np.arange(len(segments)), _LOOKS)
     point = curve.evaluate(s)
     directions = directions_of(curve, segment)
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     limits = make_limits(formation, epsilon).split(2)[0]
     rows = limits.only(PRESS, CONE).rows[:, :-4]
     none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
