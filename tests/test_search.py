@@ -227,7 +227,7 @@ def test_what_is_advised_opens_the_way() -> None:
     blocked = cuts.list_cut(own)
     assert blocked and all(edge.stop.key not in own.reached for edge in blocked)
     for opening in cuts.list_openings(blocked):
-        for cut, value in zip(blocked, opening.values, strict=True):
+        for cut, value in ((blocked[k], value) for k, value in opening.values.items()):
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
                 assert isinstance(cuts.edge_changed(cut, change), Edge)

@@ -17,8 +17,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import CurvePoint
-from wholearm.geometry.curve import Curve, Segment
+from wholearm.geometry.curve import Curve, CurvePoint, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
 from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions

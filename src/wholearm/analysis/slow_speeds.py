@@ -19,8 +19,8 @@ from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
-from ..contacts.formation import CurvePoint, Formation
-from ..geometry.curve import Curve, border, describe_pose, directions_of, solve_tangent
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, CurvePoint, border, describe_pose, directions_of, solve_tangent
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from ..common.arrays import Array, Numbers, find_root
-from ..contacts.formation import CurvePoint, Formation
+from ..contacts.formation import CurvePoint as CurvePoint
+from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, find_freedoms, metric_weights
 
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none

@@ -22,7 +22,7 @@ from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
 from ..geometry.path_guess import STILL, find_end, guess_phase, is_inside
 from ..geometry.tracing import trace_phases
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import measure_speed
 from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
@@ -98,10 +98,8 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         if path.note:
             notes.append(f"leg {leg} goes through cells: {path.note}")
         for k, (stretch, end) in enumerate(walked):
-            contacts, before = (
-                set(stretch.contacts),
-                stretches[-1] if stretches and k == 0 else None,
-            )
+            contacts = set(stretch.contacts)
+            before = stretches[-1] if stretches and k == 0 else None
             # On a border a leg may continue the one before; a reversal is a new phase.
             if before is not None and len(contacts) == 4 and set(before.contacts) == contacts:
                 runs = (before.stop - before.start) * (stretch.stop - stretch.start)
@@ -221,8 +219,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
             for contacts, until in steps:
                 start = end
                 end = find_end(Phase(index + len(walked), Formation(scene, contacts), until), start)
-                moved = metric_weights(scene) @ (end - start) ** 2
-                if moved < (STILL * scene.scales.length) ** 2:
+                if measure_speed(scene, end - start) < STILL * scene.scales.length:
                     text = f"{until} holds already at {describe_pose(start)}"
                     raise InputError("", "", text)
                 stretch = Stretch(contacts, until, start[[0, 2]], end[[0, 2]])

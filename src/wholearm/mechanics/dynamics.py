@@ -194,7 +194,7 @@ def find_freedoms(P: Array, metric: Array, least: float) -> Array:
 
 
 def measure_speed(scene: Scene, v: Array) -> float:
-    """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
+    """Size of a velocity [m/s] or displacement [m], shape (5,), in the metric of curves."""
     return float(np.sqrt(metric_weights(scene) @ v**2))
 
 

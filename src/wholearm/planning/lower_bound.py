@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array, Numbers
-from ..contacts.formation import CurvePoint
-from ..geometry.curve import Curve, directions_of
+from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..mechanics.dynamics import ONE, A, B, V, inverse
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits, find_range

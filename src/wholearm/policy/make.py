@@ -21,8 +21,8 @@ import numpy as np
 from ..common.arrays import Array, Numbers
 from ..common.errors import InputError, require_number
 from ..contacts.contact_limits import list_renamed
-from ..contacts.formation import CurvePoint, Formation
-from ..geometry.curve import Curve, directions_of
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..geometry.tracing import runs_on_curves, split_blocks, trace_phase
 from ..mechanics.dynamics import (
     LAMBDA,

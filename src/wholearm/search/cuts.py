@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -49,13 +49,11 @@ class Opening(NamedTuple):
     """Values of a number that open borders."""
 
     parameter: Parameter
-    # for each of some borders the value with which it can be followed, NaN where there is none
-    values: tuple[float, ...]
+    values: dict[int, float]  # by the border's number, of those that it opens
 
-    def open_all(self, among: Sequence[int] | None = None) -> Change:
-        """The least change that opens all borders, or some, which the number can open."""
-        chosen = self.values if among is None else [self.values[k] for k in among]
-        values = [value for value in chosen if not math.isnan(value)]
+    def open_all(self, among: Collection[int]) -> Change:
+        """The least change that opens all borders of some that the number can open."""
+        values = [value for k, value in self.values.items() if k in among]
         return Change(self.parameter, max(values) if self.parameter.sign > 0 else min(values))
 
 
@@ -81,7 +79,7 @@ def list_cut(search: RouteSearch) -> list[Blocked]:
 
 def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
-    by_key: dict[str, tuple[Parameter, list[float]]] = {}
+    by_key = dict[str, Opening]()
     for index, cut in enumerate(cuts):
         formation, epsilon = cut.border.formation, cut.border.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
@@ -92,15 +90,13 @@ def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
                 return isinstance(edge_changed(cut, Change(number, value)), Edge)
 
             for change in find_changes([number], {number: tried}.__getitem__, opens):
-                _, values = by_key.setdefault(number.key, (number, [math.nan] * len(cuts)))
-                values[index] = change.value
-    openings = [Opening(number, tuple(values)) for number, values in by_key.values()]
+                by_key.setdefault(number.key, Opening(number, {})).values[index] = change.value
 
     def rank(opening: Opening) -> tuple[int, float]:
-        first = next(k for k, value in enumerate(opening.values) if not math.isnan(value))
+        first = min(opening.values)
         return first, abs(opening.values[first] / opening.parameter.value - 1)
 
-    return sorted(openings, key=rank)
+    return sorted(by_key.values(), key=rank)
 
 
 def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
@@ -136,8 +132,8 @@ def find_opening(
         except InputError:
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
-        for k, value in enumerate(opening.values):
-            if not opening.parameter.sign * (change.value - value) >= 0:
+        for k, value in opening.values.items():
+            if opening.parameter.sign * (change.value - value) < 0:
                 continue
             before = search.reached.get(cuts[k].start.key)
             edge = edge_changed(cuts[k], change)
@@ -150,7 +146,7 @@ def find_opening(
         return result and (result[1], [k for k, edge in lasts.items() if edge in result[0].edges])
 
     for opening in list_openings(cuts)[:TRIED]:
-        most = opening.open_all()
+        most = opening.open_all(opening.values)
         route = find(opening, most, False)
         # Borders beyond those that the route crosses may need the larger change.
         least = most if route is None else opening.open_all(route[1])

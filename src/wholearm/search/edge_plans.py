@@ -21,7 +21,7 @@ from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import CostToGo, find_headings, split_blocks, trace_phase
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import measure_speed
 from ..planning.blocks import (
     BlockPlan,
     ImpactSequence,
@@ -107,14 +107,12 @@ def plan_coarsely(
             curve = trace_phase(phases[0], z)
             spent = ImpactSequence(phases[:1], [curve]).estimate(problem.epsilon)
             z, phases = curve.end, phases[1:]
-        goal = close_place(edge.stop) if len(phases) == 1 else None
-        if goal is None:
-            goal = replace(edge.stop, z=find_end(phases[0], z, phases[1:]))
-        moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
-        if moved < (STILL * problem.scene.scales.length) ** 2:
-            return None  # `until` holds already where it starts.
         alone = len(phases) == 1
-        towards = goal.z if straight and alone else None
+        closed = close_place(edge.stop) if alone else None
+        goal = closed.z if closed else find_end(phases[0], z, phases[1:])
+        if measure_speed(problem.scene, goal - z) < STILL * problem.scene.scales.length:
+            return None  # `until` holds already where it starts.
+        towards = goal if straight and alone else None
         given = list[PhasePlan[TimeMotion]]()
         if stopped is not None:
             (first,) = make_phases(problem, stopped.steps[:1])
@@ -291,7 +289,7 @@ def _aim(phase: Phase, z: Array, edge: Edge) -> Phase:
     """
     try:
         away, scene = trace_phase(phase, z).end - edge.stop.z, edge.stop.scene
-        if away**2 @ metric_weights(scene) <= (OFF * scene.scales.length) ** 2:
+        if measure_speed(scene, away) <= OFF * scene.scales.length:
             return phase
     except InputError:
         pass

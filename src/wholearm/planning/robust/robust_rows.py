@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Numbers
-from ...contacts.formation import CurvePoint, Formation
-from ...geometry.curve import Curve, directions_of
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, CurvePoint, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
