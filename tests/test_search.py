@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from dataclasses import replace
 from functools import cache, partial
@@ -228,10 +227,10 @@ def test_what_is_advised_opens_the_way() -> None:
     assert blocked and all(edge.stop.key not in own.reached for edge in blocked)
     for opening in cuts.list_openings(blocked):
         for cut, value in ((blocked[k], value) for k, value in opening.values.items()):
-            if not math.isnan(value):
-                change = Change(opening.parameter, value)
-                assert isinstance(cuts.edge_changed(cut, change), Edge)
-    text, (change,) = cuts.find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
+            change = Change(opening.parameter, value)
+            assert isinstance(cuts.edge_changed(cut, change), Edge)
+    planner = astar.RoutePlanner(rough, None, own, PlanOptions(), Reporter(None))
+    text, (change,) = cuts.find_opening(planner, 0.0)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
@@ -251,15 +250,16 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     (goal,), told = crossing.goals, list[str]()
     own = search(goal, crossing)
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))
-    text, (change,) = cuts.find_hand(own, crossing, PlanOptions(), 0.0, told.append)
+    planner = astar.RoutePlanner(crossing, None, own, PlanOptions(), Reporter(told.append))
+    text, (change,) = cuts.find_hand(planner, 0.0)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
     assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}
     changed = crossing.with_(change.values)
     closed = [close_fingers(p.scene, np.zeros(1), p.start[2:3]) for p in (crossing, changed)]
     assert [bool(c.obstacle.any()) for c in closed] == [True, False]
 
-    late = Mock(side_effect=OutOfTime)
-    text, changes = cuts.find_hand(own, crossing, PlanOptions(), 0.0, late)
+    planner.report = Reporter(Mock(side_effect=OutOfTime))
+    text, changes = cuts.find_hand(planner, 0.0)
     assert changes == () and "not reached with 0 other" in text
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -148,7 +147,7 @@ def build_map(
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     tangents = np.zeros((len(z), len(WAYS), 5))
     tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
-    directions = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
+    directions = _check_motions(problem, labels, z, kinematics, tangents, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
     return FormationMap(problem, x, phi, *parts, places, *directions)
@@ -178,9 +177,8 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
         _, sizes, right = np.linalg.svd(kinematics.A / weights)
         z_s = right[:, -1] / weights
         z_s *= np.where(z_s[np.arange(len(rows)), rows] < 0, -1.0, 1.0)[:, None]
-        regular = sizes[:, -1] > REGULAR * sizes[:, 0]
-        tangents = np.stack([z_s, -z_s], axis=1)
-        motions = problem, chosen, z[flush], kinematics, regular, tangents, limit
+        z_s[~(sizes[:, -1] > REGULAR * sizes[:, 0])] = 0.0
+        motions = problem, chosen, z[flush], kinematics, np.stack([z_s, -z_s], axis=1), limit
         possible, flags[2, flush] = _check_motions(*motions)
         flags[:2, flush] = possible.T
     table, borders = contact_table(scene), []
@@ -221,34 +219,30 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
 
 
 def _check_motions(
-    problem: Problem,
-    labels: Numbers,
-    z: Array,
-    kinematics: Kinematics,
-    regular: Flags,
-    tangents: Array,
-    limit: float,
+    problem: Problem, labels: Numbers, z: Array, kinematics: Kinematics, ways: Array, limit: float
 ) -> tuple[Flags, Flags]:
-    """Whether quasistatic motions along `tangents`, (n, k, 5), are feasible, (n, k).
+    """Whether quasistatic motions along tangents `ways`, (n, k, 5), are feasible, (n, k).
 
     And whether one more would be, but contact forces are not unique, (n,): their uniqueness margin
-    is below the `limit`. What is not `regular` is left out.
+    is below the `limit`. Tangents that are zero are left out.
     """
-    scene = problem.scene
-    held, unique = np.zeros((2, *tangents.shape[:2]), dtype=bool)
-    for (formation, mine), k in product(group_alike(scene, labels), range(tangents.shape[1])):
-        every = CurvePoint(z, tangents[:, k], 0 * z, kinematics)
-        rows, of_all = np.flatnonzero(mine & regular), Directions.of(kinematics, tangents[:, k])
-        if formation.n_constraints == 3:
-            wrench = force_rows(formation, kinematics, of_all)[rows, :, :3]
-            rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
-        point, directions = every.pick(rows), Directions(*(signs[rows] for signs in of_all))
-        forces = inverse(formation, point, directions)
-        limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
-        still = np.zeros(len(rows))
-        low, high = limits.find_span(still, still, problem.epsilon)
-        held[rows, k] = low <= high
-        unique[rows, k] = find_minors(formation, point.kinematics, directions.Xi).ratios >= limit
+    scene, regular = problem.scene, ways.any(axis=(1, 2))
+    held, unique = np.zeros((2, *ways.shape[:2]), dtype=bool)
+    for k, z_s in enumerate(ways.swapaxes(0, 1)):
+        every, of_all = CurvePoint(z, z_s, 0 * z, kinematics), Directions.of(kinematics, z_s)
+        for formation, mine in group_alike(scene, labels):
+            rows = np.flatnonzero(mine & regular)
+            if formation.n_constraints == 3:
+                wrench = force_rows(formation, kinematics, of_all)[rows, :, :3]
+                rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
+            point, directions = every.pick(rows), Directions(*(signs[rows] for signs in of_all))
+            forces = inverse(formation, point, directions)
+            limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
+            still = np.zeros(len(rows))
+            low, high = limits.find_span(still, still, problem.epsilon)
+            held[rows, k] = low <= high
+            minors = find_minors(formation, point.kinematics, directions.Xi)
+            unique[rows, k] = minors.ratios >= limit
     return held & unique, np.any(held & ~unique, axis=1)
 
 

@@ -25,7 +25,7 @@ from ..mechanics.limits import EPSILON, make_limits
 from ..planning.explain import change_curve, find_changes, list_frictions, unadvised
 from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
-from ..problem.definition import Goal, Phase, Problem
+from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
 from .astar import EAGER, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
@@ -109,26 +109,21 @@ def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
     return Chain((border,)).stop_at(blocked.steps[0].until)
 
 
-def find_opening(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
+def find_opening(planner: RoutePlanner, seconds: float) -> tuple[str, tuple[Change, ...]]:
     """The change of a single number with which the goal is reached, in words and as such.
 
     It is looked for on the borders that are shut, and tried by a search beyond those that it opens;
-    then among other lengths and places of the fingers. The `search` that did not reach the goal has
-    taken `seconds` of processor time.
+    then among other lengths and places of the fingers. The search of the `planner`, which did not
+    reach the goal, has taken `seconds` of processor time.
     """
-    report("looking for a number that opens the way")
-    cuts, tried = list_cut(search)[:CUT], list[str]()
+    planner.report("looking for a number that opens the way")
+    search, tried = planner.search, list[str]()
+    cuts = list_cut(search)[:CUT]
 
     def find(opening: Opening, change: Change, planned: bool) -> tuple[float, Sequence[int]] | None:
         """About how long a route beyond opened borders takes [s], and which of them it crosses."""
         try:
-            changed = problem.with_(change.values)
+            changed = planner.problem.with_(change.values)
         except InputError:
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
@@ -142,7 +137,7 @@ def find_opening(
                 sources.append(before.extend(edge))
         if not sources:
             return None
-        result = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
+        result = _search_changed(planner, changed, search.start.z, planned, sources)
         return result and (result[1], [k for k, edge in lasts.items() if edge in result[0].edges])
 
     for opening in list_openings(cuts)[:TRIED]:
@@ -155,7 +150,7 @@ def find_opening(
             if reached is not None:
                 return _describe_reached(change, reached[0]), (change,)
         tried.append(str(most))
-    text, changes = find_hand(search, problem, options, seconds, report)
+    text, changes = find_hand(planner, seconds)
     if tried and not changes:
         text = f"the goal is not reached with {', nor with '.join(tried)}; {text}"
     return text, changes
@@ -166,18 +161,17 @@ def _describe_reached(change: Change, duration: float) -> str:
 
 
 def _search_changed(
+    planner: RoutePlanner,
     changed: Problem,
     z: Array,
-    goal: Goal,
-    options: PlanOptions,
     planned: bool,
     sources: Sequence[Route] = (),
     most: int = NEARBY,
 ) -> tuple[Route, float] | None:
     """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
-    changed = replace(changed, start=z)
-    roadmap = Roadmap(changed, options.uniqueness_margin)
-    search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
+    changed, options = replace(changed, start=z), planner.options
+    roadmap, start = Roadmap(changed, options.uniqueness_margin), make_place(changed.scene, z)
+    search = RouteSearch(roadmap, start, planner.search.goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
     planner = RoutePlanner(changed, None, search, rough, Reporter(None), first_only=True)
@@ -191,32 +185,25 @@ def _search_changed(
     return (planner.made[0][1], planner.made[0][0].duration) if planner.made else None
 
 
-def find_hand(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
+def find_hand(planner: RoutePlanner, seconds: float) -> tuple[str, tuple[Change, ...]]:
     """The least change of `list_hands` with which the goal is reached from the same pose."""
-    tried, ended = 0, "; the time for such trials is over"
+    search, tried, ended = planner.search, 0, "; the time for such trials is over"
     stop = time.process_time() + max(TIMES * seconds, AT_LEAST)
     with suppress(OutOfTime):
-        for change in list_hands(problem.scene):
+        for change in list_hands(planner.problem.scene):
             if time.process_time() > stop:
                 break
-            report(f"looking for routes with {change}")
+            planner.report(f"looking for routes with {change}")
             tried += 1
             try:
-                changed = problem.with_(change.values)
+                changed = planner.problem.with_(change.values)
                 require_reach(changed.scene, search.goal, float(search.start.z[2]))
             except (InputError, InfeasibleError):
                 continue
             closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
             if closed.obstacle.any():
                 continue
-            z, goal = closed.z[0], search.goal
-            result = _search_changed(changed, z, goal, options, True, most=EAGER.most)
+            result = _search_changed(planner, changed, closed.z[0], True, most=EAGER.most)
             if result is not None:
                 return _describe_reached(change, result[1]), (change,)
         else:

@@ -208,11 +208,10 @@ def _explain(
     planner: RoutePlanner, seconds: float, hurry: Callable[[], None] | None
 ) -> InfeasibleError:
     """Why nothing leads to a goal, after so many seconds of search [s]."""
-    search, problem, options = planner.search, planner.problem, planner.options
-    opening, changes, text = "", tuple[Change, ...](), ""
+    search, opening, changes, text = planner.search, "", tuple[Change, ...](), ""
     with _ending(hurry):
-        opening, changes = find_opening(search, problem, options, seconds, planner.report)
-        explain = partial(explain_block, problem, options)
+        opening, changes = find_opening(planner, seconds)
+        explain = partial(explain_block, planner.problem, planner.options)
         text = describe_block(search, planner.failures, opening, explain)
     text = text or describe_block(search, planner.failures, opening)
     return InfeasibleError(text, changes=changes)
