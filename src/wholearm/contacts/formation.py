@@ -1,12 +1,8 @@
 """Contact formations: constraints P z' = 0 with their derivatives, and gap limits.
 
-With the rows of all contacts, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n]; sliding velocities are
-v_t = A_t z' with A_t = [W_t^T, -J_t]. Rolling contacts have v_t = 0 as well:
-
-    P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
-
-n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`elemental`), which
-keeps its value from where the rolling begins.
+Eq. (4) reads A z' = 0; sliding velocities are v_t = A_t z', zero for rolling contacts, so that P =
+[A; A_t(rolling)] (`mechanics/README.md`). Rolling is holonomic here: v_t is the rate of a slip
+coordinate (`elemental`), which keeps its value from where the rolling begins.
 """
 
 from __future__ import annotations

@@ -1,16 +1,11 @@
 """The constrained equations of motion of object and fingers, forward and inverse.
 
-Eqs. (1)-(4) are together (notation: `README.md`)
+Eqs. (1)-(4) are together (notation: `README.md`), with b = B z' + D sigma of the joints' friction,
 
-    M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0,   P = [A; A_t(rolling)],
+    M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0.
 
-where b = B z' + D sigma is joint friction, sigma the directions of the joints and S = [0; I]. The
-contact forces c = [c_n; c_t(rolling)] are as many as the constraints, n_c + R, and
-
-    G = [A - U Xi A_t; A_t(rolling)],  with zero for U Xi of a rolling contact,
-
-are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Three
-routes through the equations:
+A sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free, in c. Three routes
+through the equations:
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
