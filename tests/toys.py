@@ -107,11 +107,10 @@ class Toy:
             yield
 
     def _inverse(self, _: Any, point: CurvePoint, directions: Directions) -> PathForces:
-        z = point.z
-        C, T = np.zeros((len(z), 1, 5)), np.zeros((len(z), 2, 5))
+        C, T = (np.zeros((len(point.z), count, 5)) for count in (1, 2))
         C[..., LAMBDA] = 1.0
         # The segment's number stands in for the directions of its joints.
-        T[..., A], T[..., LAMBDA], T[..., V] = self.law(z[:, 0], directions.sigma[:, 0] > 0)
+        T[..., A], T[..., LAMBDA], T[..., V] = self.law(point.z[:, 0], directions.sigma[:, 0] > 0)
         return PathForces(C, T)
 
 

@@ -294,21 +294,20 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     motion keeps the limits, friction jams or contact forces are not unique. Limits are kept at one
     place of each interval, with any internal force.
     """
-    durations = np.full((len(borders), 2), np.inf)
     if not borders:
-        return durations
+        return np.zeros((0, 2))
     scene, weights = problem.scene, metric_weights(problem.scene)
     (steps, places, part), table = make_cosine_grid(NODES), contact_table(scene)
     every = []
-    for border in borders:
-        chords = np.diff(border.z, axis=0)
+    for points in (each for border in borders for each in (border.z, border.z[::-1])):
+        chords = np.diff(points, axis=0)
         arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
         s = places * arcs[-1]
-        z = interpolate(s, arcs, border.z)
+        z = interpolate(s, arcs, points)
         every.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
     z, chord, length = (np.concatenate(column) for column in zip(*every, strict=True))
     indices = [[table.index(contact) for contact in border.contacts] for border in borders]
-    labels = np.repeat(np.array(indices), NODES, axis=0)
+    labels = np.repeat(np.array(indices), 2 * NODES, axis=0)
     # One Newton step: between points of the map the contacts do not quite close.
     at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
@@ -316,23 +315,19 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     at = evaluate_each(scene, labels, z, run)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
     # With the share of length as path parameter.
-    tangent, curvature = length * z_s, length**2 * z_ss
+    whole, durations = CurvePoint(z, length * z_s, length**2 * z_ss, at), np.empty(2 * len(borders))
     for formation, mine in group_alike(scene, labels):
-        kinematics = at.pick(mine)
-        every_limit = make_limits(formation, problem.epsilon)
-        for back, sign in enumerate((1, -1)):
-            turned = sign * tangent[mine]
-            directions = Directions.of(kinematics, turned)
-            point = CurvePoint(z[mine], turned, curvature[mine], kinematics)
-            forces = inverse(formation, point, directions)
-            rows, cap = PathLimits.of(every_limit, forces, turned[:, 3:], GIVE).eliminate()
-            inertia = reduced_inertia(formation, kinematics, directions)
-            ratios = find_minors(formation, kinematics, directions.Xi).ratios
-            # No motion passes where b <= 0.
-            closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-            rows[closed], cap[closed] = 0.0, 0.0
-            rows = rows.reshape(-1, NODES, *rows.shape[1:])[:, ::sign]
-            limits = PathLimits(rows, cap.reshape(-1, NODES)[:, ::sign])
-            motion = speed_sweep(limits, steps, part, sweeps=2)
-            durations[mine[::NODES], back] = motion.find_durations(steps)
-    return durations
+        point = whole.pick(mine)
+        directions = Directions.of(point.kinematics, point.z_s)
+        forces = inverse(formation, point, directions)
+        limits = make_limits(formation, problem.epsilon)
+        rows, cap = PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
+        inertia = reduced_inertia(formation, point.kinematics, directions)
+        ratios = find_minors(formation, point.kinematics, directions.Xi).ratios
+        # No motion passes where b <= 0.
+        closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
+        rows[closed], cap[closed] = 0.0, 0.0
+        on_paths = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
+        motion = speed_sweep(on_paths, steps, part, sweeps=2)
+        durations[mine[::NODES]] = motion.find_durations(steps)
+    return durations.reshape(-1, 2)
