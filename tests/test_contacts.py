@@ -322,7 +322,7 @@ def test_known_contacts_are_where_closing_fingers_come_to_touch(
         found = (labels[:, 1 + finger] - closing.first_contact(scene, finger)) // 4
         assert set(found.tolist()) == kinds
     # Joint angles lose digits where a link is stretched towards what it touches.
-    np.testing.assert_allclose(closing.place(scene, labels, poses), z, atol=1e-10)
+    np.testing.assert_allclose(closing.place_at(scene, labels, poses), z, atol=1e-10)
 
 
 def test_rates_are_those_of_contacts_that_stay_closed() -> None:
@@ -331,7 +331,7 @@ def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     z, z_u, z_uu, _ = closing.move(scene, labels, poses, ways)
     # Steps with errors of truncation and rounding below the tolerances.
     (left, right), (before, after) = (
-        [closing.place(scene, labels, poses + side * step * ways) for side in (-1, 1)]
+        [closing.place_at(scene, labels, poses + side * step * ways) for side in (-1, 1)]
         for step in (1e-5, 1e-4)
     )
     # Away from where a link is stretched, where derivatives grow.

@@ -25,8 +25,7 @@ from wholearm.common.errors import Change, InfeasibleError, InputError, SolverEr
 from wholearm.common.files import make_folder
 from wholearm.common.parallel import share
 from wholearm.common.signals import OutOfTime, Reporter
-from wholearm.contacts.closing import close_fingers, contact_table
-from wholearm.contacts.closing import place as place_at
+from wholearm.contacts.closing import close_fingers, contact_table, place_at
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import CostToGo, trace_phase

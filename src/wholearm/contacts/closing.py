@@ -265,7 +265,7 @@ def name_reach(scene: Scene, phi: float) -> str:
     return f"at that angle the hand closes for x {' and '.join(spans)}"
 
 
-def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
+def place_at(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]], z[:, 1], count = poses, 0.0, scene.polygon.n_vertices
@@ -288,7 +288,7 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
 
 def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> CurvePoint:
     """Straight paths at poses (x, phi) with rates (x', phi'), (n, 2), and labels (n, 3)."""
-    z = place(scene, labels, poses)
+    z = place_at(scene, labels, poses)
     A = evaluate_each(scene, labels, z).A
     z_u, z_uu, levers = np.zeros_like(z), np.zeros_like(z), A[:, [1, 2], [3, 4]]
     z_u[:, [0, 2]], z_u[:, 1] = rates, -A[:, 0, 2] * rates[:, 1]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
 
 
-SAME = 9  # decimals of an angle in degrees that a printed phase has at most
+PRINTED = 9  # decimals of an angle in degrees that a printed phase has at most
 NEEDED = {"settle_gap": "settle", "control_hold": "control_period"}
 """Keys of a file that have no effect without another one."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
@@ -191,7 +191,7 @@ def write_until(until: Until, digits: int) -> Any:
 
 def format_until(until: Until) -> str:
     """The value of `until` in a problem file, to read."""
-    return _write(write_until(until, SAME))
+    return _write(write_until(until, PRINTED))
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:

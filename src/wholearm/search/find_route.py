@@ -32,7 +32,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
-from ..problem.table import SAME, describe_phase, describe_scene, write_toml
+from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
 from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edges import Blocked
@@ -366,4 +366,4 @@ class Answer(Alternative):
 
 def format_phases(problem: Problem) -> str:
     """The phases of a problem as `[[phases]]` of a problem file."""
-    return write_toml({"phases": [describe_phase(phase, SAME) for phase in problem.phases]})[1:]
+    return write_toml({"phases": [describe_phase(phase, PRINTED) for phase in problem.phases]})[1:]

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..common.arrays import Array, Flags, Numbers
-from ..contacts.closing import contact_table, first_contact, move
-from ..contacts.closing import place as place_at
+from ..contacts.closing import contact_table, first_contact, move, place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.path_guess import is_inside
