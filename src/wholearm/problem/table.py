@@ -112,10 +112,9 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         table["goal"] = goals[0] if len(goals) == 1 else goals
     elif problem.phases:
         table["phases"] = [describe_phase(phase) for phase in problem.phases]
-    for prefix, part in _list_parts(problem.scene):
-        for key, value, field in _list_values((prefix, part)):
-            if field.required or value != field.shown_default:
-                _set(table, key, value)
+    for key, value, field in _list_values(*_list_parts(problem.scene)):
+        if field.required or value != field.shown_default:
+            _set(table, key, value)
     for key, needed in NEEDED.items():
         if key in table:
             table.setdefault(needed, 0.0)
