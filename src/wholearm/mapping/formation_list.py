@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array, Numbers
+from ..common.arrays import Array, Numbers, round_to
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, describe_obstacle
@@ -281,9 +281,9 @@ def _list_steps(
 def end_at(scene: Scene, row: int, pose: Array) -> Until:
     """The end of a phase at x or phi of a pose, rounded as in problem files."""
     if row == 0:
-        digits = math.ceil(-math.log10(DIGITS * scene.scales.length))
-        return Until(coordinate="x", value=round(float(pose[0]), digits))
-    degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
+        x = round_to(float(pose[0]), DIGITS * scene.scales.length)
+        return Until(coordinate="x", value=x)
+    degrees = round_to(math.degrees(pose[1]), math.degrees(DIGITS))
     return Until(coordinate="phi", value=math.radians(degrees))
 
 
@@ -300,20 +300,15 @@ def split_leg(scene: Scene, leg: Leg) -> list[Part]:
     sign = 1 if leg.stop >= leg.start else -1
     # The start is that of the leg before, up to rounding.
     margins = (1e-4 * near, near)[::sign]
-    kept = [
-        piece
-        for piece in leg.pieces
-        if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
-    ]
-    reached = [float(s) for piece in kept for s in piece.places[[0, -1]]]
-    ends = [low + near, *reached, high - near]
+    spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in leg.pieces]
+    spans = [span for span in spans if span[2] > low + margins[0] and span[1] < high - margins[1]]
+    ends = [low + near, *(s for _, *both in spans for s in both), high - near]
     for before, after in zip(ends[::2], ends[1::2], strict=True):
         if after - before > 1e-6 * leg.near:
             pose = leg.at((before + after) / 2)
             text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
             text = text or "there the border has ended"
             raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
-    spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
     # The ends of shorter parts are one crossing.
     spans = [span for span in spans if span[2] - span[1] > 1e-3 * leg.near] or spans
     if sign < 0:

@@ -15,7 +15,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, round_to
 from ..common.errors import InputError, SolverError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
@@ -180,16 +180,11 @@ def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
         count = math.ceil(POSES * (span.stop - span.start) / motion.duration)
         for time in np.linspace(span.start, span.stop, count + 1)[1:].tolist():
             x, _, phi, *_ = motion.evaluate(np.array([time])).z[0].tolist()
-            t, x = _round(time, GUESSED * motion.duration), _round(x, GUESSED * length)
+            t, x = round_to(time, GUESSED * motion.duration), round_to(x, GUESSED * length)
             # In degrees, as it is printed.
-            phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
+            phi = math.radians(round_to(math.degrees(phi), math.degrees(GUESSED)))
             modes.append(ModeGuess(t, x, phi, signs))
     return tuple(modes)
-
-
-def _round(value: float, unit: float) -> float:
-    """A value with the decimals of a unit, and no negative zero."""
-    return round(value, math.ceil(-math.log10(unit))) + 0.0
 
 
 def split_route(edges: Sequence[Edge]) -> list[list[Edge]]:
@@ -265,7 +260,7 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     length = formation.scene.scales.length
     x, _, phi, *_ = np.abs(find_headings(formation.add(until.contact), z) or np.eye(5))[0]
     name, digits = ("x", length) if x > length * phi else ("phi", 1.0)
-    value = _round(float(z[ROWS[name]]), PINNED * digits)
+    value = round_to(float(z[ROWS[name]]), PINNED * digits)
     return replace(phase, until=replace(until, pins=((name, value),)))
 
 
