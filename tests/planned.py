@@ -74,7 +74,7 @@ class CosineMotion:
         point = self.curve.evaluate(s)
         owner = np.clip(np.searchsorted(self.turns, t, side="right") - 1, 0, len(self.turns) - 2)
         formation, directions = self.curve.formation, directions_of(self.curve, owner)
-        forces = inverse(formation, *point[:3], directions)
+        forces = inverse(formation, point, directions)
         # The sense of the null vector is that of the curve; here a squeeze always presses.
         sense = np.where(forces.of_c[..., LAMBDA].sum(axis=1) < 0, -1.0, 1.0)
         squeeze = sense * self.squeeze * (1 - self.fade * t / self.duration)

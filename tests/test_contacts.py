@@ -306,7 +306,7 @@ def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
     scene = plane.make_scene(lengths=(0.11, 0.09), radius=radius)
     rng = np.random.default_rng(3)
     x, phi = rng.uniform(-0.06, 0.06, 400), rng.uniform(-4, 4, 400)
-    labels = label_cells(scene, x, phi)[:, [0, 2, 4]]
+    labels = label_cells(scene, np.column_stack([x, phi]))
     usable = (labels >= 0).all(axis=1)
     assert usable.mean() > 0.25
     labels, x, phi = labels[usable], x[usable], phi[usable]
@@ -322,7 +322,7 @@ def test_known_contacts_are_where_closing_fingers_come_to_touch(
         found = (labels[:, 1 + finger] - closing.first_contact(scene, finger)) // 4
         assert set(found.tolist()) == kinds
     # Joint angles lose digits where a link is stretched towards what it touches.
-    np.testing.assert_allclose(closing.place(scene, labels, poses), z, atol=1e-10)
+    np.testing.assert_allclose(closing.place_at(scene, labels, poses), z, atol=1e-10)
 
 
 def test_rates_are_those_of_contacts_that_stay_closed() -> None:
@@ -331,7 +331,7 @@ def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     z, z_u, z_uu, _ = closing.move(scene, labels, poses, ways)
     # Steps with errors of truncation and rounding below the tolerances.
     (left, right), (before, after) = (
-        [closing.place(scene, labels, poses + side * step * ways) for side in (-1, 1)]
+        [closing.place_at(scene, labels, poses + side * step * ways) for side in (-1, 1)]
         for step in (1e-5, 1e-4)
     )
     # Away from where a link is stretched, where derivatives grow.

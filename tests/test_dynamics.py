@@ -21,6 +21,7 @@ from wholearm import solve as plan
 from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
+from wholearm.contacts.formation import CurvePoint
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse, reduced_inertia
@@ -84,7 +85,8 @@ def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
         z_s, speed = v / np.linalg.norm(v), np.array([np.linalg.norm(v)])
         z_ss = np.linalg.lstsq(kinematics.P[0], -kinematics.P_dot_v[0] / speed**2)[0]
         motion = rng.uniform(-2, 2, 1), speed**2, rng.uniform(1, 5, 1)
-        forces = inverse(formation, z[None], z_s[None], z_ss[None], directions)
+        point = CurvePoint(z[None], z_s[None], z_ss[None], kinematics)
+        forces = inverse(formation, point, directions)
         assert np.linalg.norm(forces.of_c[0, :, LAMBDA]) == pytest.approx(1.0, abs=1e-12)
         tau, c = forces.tau(*motion)[0], forces.c(*motion)[0]
         acceleration, found = forward(formation, z, v, tau, directions)
@@ -168,7 +170,7 @@ def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
     (curve,) = trace_phases(read_lines(text))
     (part,) = curve.segments
     place = curve.evaluate(np.linspace(0.0, curve.length, 300))
-    null = inverse(curve.formation, *place[:3], Directions(part.Xi, part.sigma)).of_c[..., LAMBDA]
+    null = inverse(curve.formation, place, Directions(part.Xi, part.sigma)).of_c[..., LAMBDA]
     pressing = null.sum(axis=1)
     assert pressing.min() < 0.0 < pressing.max()
     assert np.abs(np.diff(null, axis=0)).max() < 0.05

@@ -184,16 +184,16 @@ def test_every_change_of_cell_is_a_border(every: FormationMap) -> None:
     size = np.array([every.x[-1] - every.x[0], every.phi[-1] - every.phi[0]])
     starts = np.array([every.x[0], every.phi[0]]) + rng.uniform(0.02, 0.98, (1500, 2)) * size
     stops = starts + rng.uniform(-0.02, 0.02, (1500, 2)) * size
-    first, last = (label_cells(scene, *points.T) for points in (starts, stops))
+    first, last = (label_cells(scene, points) for points in (starts, stops))
     both = (first[:, 0] != NOWHERE) & (last[:, 0] != NOWHERE) & (first != last).any(axis=1)
     assert both.sum() > 60
     low, high, first = starts[both], stops[both], first[both]
     for _ in range(50):
         middle = (low + high) / 2
-        labels = label_cells(scene, *middle.T)
+        labels = label_cells(scene, middle)
         same = (labels == first).all(axis=1)[:, None]
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    found = label_cells(scene, *high.T)[:, 0] != NOWHERE
+    found = label_cells(scene, high)[:, 0] != NOWHERE
     # Borders are drawn with chords of at most 2 mm or 0.01 rad on curves of radius 50 mm or more.
     assert distance_to(list(every.borders), low[found]).max() < 2e-5
 
@@ -257,7 +257,7 @@ def test_directions_inside_cells_balance(chart: FormationMap) -> None:
     for k in rng.choice(len(chart.places), 80, replace=False):
         place = chart.places[k]
         z = close_fingers(scene, *place[:, None]).z
-        label = label_cells(scene, *place[:, None])[0]
+        label = label_cells(scene, place)
         contacts = tuple(contact_table(scene)[i] for i in label if i != NOWHERE)
         formation = Formation(scene, contacts)
         part = formation.evaluate(z, z)

@@ -264,7 +264,7 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
         for column in (1 + sign * drive / formation.scene.torque_limit).T / make.SETTINGS.spare:
             assert np.abs(rows[..., 0] - column[:, None]).max(axis=0).min() < 1e-12
     # Predictions: the internal force that presses most is less free.
-    forces = inverse(formation, *point[:3], directions_of(curve, np.zeros(7, int)))
+    forces = inverse(formation, point, directions_of(curve, np.zeros(7, int)))
     fast = np.zeros(7), np.full(7, 4.0)
     assert fast[1].all()
     grasp = InternalForceLimits.of(formation, forces, point.z_s[:, 3:]).find_best(*fast)
@@ -286,7 +286,7 @@ def test_slack_is_that_of_the_motion(curves: tuple[Curve, ...], phase: int) -> N
     point, segment = curve.evaluate(s), np.searchsorted([p.stop for p in curve.segments[:-1]], s)
     a, b, internal = (rng.uniform(*ends, count) for ends in ((-9, 9), (0, 2), (0, 5)))
     directions = directions_of(curve, segment)
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     tau, z_dot = forces.tau(a, b, internal), point.z_s * np.sqrt(b)[:, None]
     acceleration, c = forward(formation, formation.evaluate(point.z, z_dot), z_dot, tau, directions)
     z_ddot = point.z_s * a[:, None] + point.z_ss * b[:, None]

@@ -254,7 +254,7 @@ def least_shortfall(problem: Problem, phase: int, row: int) -> float:
     # There b is 0 and a >= 0. Rows are c_n, then tau.
     curve = trace_phases(problem)[phase]
     point, directions = curve.evaluate(np.zeros(1)), directions_of(curve, np.zeros(1, dtype=int))
-    forces, limit = inverse(curve.formation, *point[:3], directions), problem.scene.torque_limit
+    forces, limit = inverse(curve.formation, point, directions), problem.scene.torque_limit
     c_n, tau = forces.of_c[0], forces.of_tau[0]
     rows = np.vstack([c_n, tau, -tau])
     right = np.concatenate([np.full(len(c_n), problem.epsilon), -limit, -limit]) - rows[:, ONE]

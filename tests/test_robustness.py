@@ -412,7 +412,7 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(which: str) -> None:
     point = way.evaluate(np.array([s]))
     segment = np.searchsorted([part.stop for part in way.segments][:-1], [s])
     directions = directions_of(way, segment)
-    forces = dynamics.inverse(way.formation, *point[:3], directions, point.kinematics)
+    forces = dynamics.inverse(way.formation, point, directions)
     along = Sensitivity.of_curve(way.formation, point, directions, forces)
     slopes = along.find_slopes([*names, "start_x"])[0] @ dynamics.stack_motion(a, b, squeeze)[0]
     tau, here = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from dataclasses import replace
 from functools import cache, partial
@@ -26,8 +25,7 @@ from wholearm.common.errors import Change, InfeasibleError, InputError, SolverEr
 from wholearm.common.files import make_folder
 from wholearm.common.parallel import share
 from wholearm.common.signals import OutOfTime, Reporter
-from wholearm.contacts.closing import close_fingers, contact_table
-from wholearm.contacts.closing import place as place_at
+from wholearm.contacts.closing import close_fingers, contact_table, place_at
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import CostToGo, trace_phase
@@ -227,11 +225,11 @@ def test_what_is_advised_opens_the_way() -> None:
     blocked = cuts.list_cut(own)
     assert blocked and all(edge.stop.key not in own.reached for edge in blocked)
     for opening in cuts.list_openings(blocked):
-        for cut, value in zip(blocked, opening.values, strict=True):
-            if not math.isnan(value):
-                change = Change(opening.parameter, value)
-                assert isinstance(cuts.edge_changed(cut, change), Edge)
-    text, (change,) = cuts.find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
+        for cut, value in ((blocked[k], value) for k, value in opening.values.items()):
+            change = Change(opening.parameter, value)
+            assert isinstance(cuts.edge_changed(cut, change), Edge)
+    planner = astar.RoutePlanner(rough, None, own, PlanOptions(), Reporter(None))
+    text, (change,) = cuts.find_opening(planner, 0.0)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
@@ -251,15 +249,16 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     (goal,), told = crossing.goals, list[str]()
     own = search(goal, crossing)
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))
-    text, (change,) = cuts.find_hand(own, crossing, PlanOptions(), 0.0, told.append)
+    planner = astar.RoutePlanner(crossing, None, own, PlanOptions(), Reporter(told.append))
+    text, (change,) = cuts.find_hand(planner, 0.0)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
     assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}
     changed = crossing.with_(change.values)
     closed = [close_fingers(p.scene, np.zeros(1), p.start[2:3]) for p in (crossing, changed)]
     assert [bool(c.obstacle.any()) for c in closed] == [True, False]
 
-    late = Mock(side_effect=OutOfTime)
-    text, changes = cuts.find_hand(own, crossing, PlanOptions(), 0.0, late)
+    planner.report = Reporter(Mock(side_effect=OutOfTime))
+    text, changes = cuts.find_hand(planner, 0.0)
     assert changes == () and "not reached with 0 other" in text
 
 
@@ -381,7 +380,7 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
         assert np.abs(both.evaluate(z, z).C).max() < 1e-9
     for part in parts:
         middle = (part.start + part.stop) / 2
-        label = label_cells(scene, *middle[:, None])[0]
+        label = label_cells(scene, middle)
         table = contact_table(scene)
         assert part.contacts == tuple(table[i] for i in label if i != NOWHERE)
 
@@ -413,7 +412,7 @@ def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
 def test_a_leg_beside_a_curved_border(heptagon: Problem, bulge: float, crosses: bool) -> None:
     """Where it is less than the tolerance beyond the border, it stays in its cell."""
     scene, leg = heptagon.scene, beside_border(heptagon, bulge)
-    on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
+    on_finger_2 = label_cells(scene, np.linspace(*leg, 300))[:, 2]
     assert (np.diff(on_finger_2) != 0).sum() == 2
     parts = split_leg(scene, *leg)
     touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
@@ -625,7 +624,7 @@ def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> Non
 def test_a_place_out_of_reach_changes_nothing_at_others() -> None:
     scene, rng = problem_of(HEPTAGON).scene, np.random.default_rng(1)
     poses = np.column_stack([rng.uniform(-0.1, 0.1, 300), rng.uniform(-4, 4, 300)])
-    labels, runs = label_cells(scene, *poses.T)[:, [0, 2, 4]], rng.normal(size=poses.shape)
+    labels, runs = label_cells(scene, poses), rng.normal(size=poses.shape)
     inside = (labels >= 0).all(axis=1)
     labels, poses, runs = labels[inside], poses[inside], runs[inside] * [0.03, 1.0]
     far = poses + np.array([1.0, 0.0])

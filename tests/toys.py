@@ -106,13 +106,11 @@ class Toy:
             patch.setattr(path_plan, "find_sure_start", lambda *_: None)
             yield
 
-    def _inverse(
-        self, _: Any, z: Array, z_s: Array, z_ss: Array, directions: Directions, __: Any
-    ) -> PathForces:
-        C, T = np.zeros((len(z), 1, 5)), np.zeros((len(z), 2, 5))
+    def _inverse(self, _: Any, point: CurvePoint, directions: Directions) -> PathForces:
+        C, T = (np.zeros((len(point.z), count, 5)) for count in (1, 2))
         C[..., LAMBDA] = 1.0
         # The segment's number stands in for the directions of its joints.
-        T[..., A], T[..., LAMBDA], T[..., V] = self.law(z[:, 0], directions.sigma[:, 0] > 0)
+        T[..., A], T[..., LAMBDA], T[..., V] = self.law(point.z[:, 0], directions.sigma[:, 0] > 0)
         return PathForces(C, T)
 
 

@@ -337,7 +337,7 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
         directions = Directions.of(point.kinematics, point.z_s)
     else:
         return None
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
     inertia = reduced_inertia(formation, point.kinematics, directions)
     return PathSamples(phase, curve, s, point, directions, forces, limits, inertia)

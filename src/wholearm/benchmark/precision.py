@@ -417,7 +417,7 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
 def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
     """Limits at places of a curve, whose segments are `owner`."""
     curve, point = instance.curve, instance.curve.evaluate(s)
-    forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
+    forces = inverse(curve.formation, point, directions_of(curve, owner))
     limits = make_limits(curve.formation, instance.problem.epsilon)
     return PathLimits.of(limits, forces, point.z_s[:, 3:])
 

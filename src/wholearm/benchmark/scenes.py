@@ -162,7 +162,7 @@ def _draw_leg(
         return here + rng.uniform(0.1, 1.2) * (poses[-2] - here) if len(poses) > 1 else None
     if kind == "cell":
         there = here + rng.normal(0.0, 0.5, 2) * size
-        inside = label_cells(scene, there[:1], there[1:])[0, 0] != NOWHERE
+        inside = label_cells(scene, there)[0] != NOWHERE
         return there if inside else None
     near = [piece for piece in pieces if _distance(piece, here, size) < 0.02]
     choice = pieces if kind == "border" else near

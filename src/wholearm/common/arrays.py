@@ -78,6 +78,11 @@ def interpolate(x: Array | float, places: Array, rows: Array) -> Array:
     return np.stack([np.interp(x, places, column) for column in rows.T], axis=-1)
 
 
+def round_to(value: float, unit: float) -> float:
+    """A value with the decimals of a unit, and no negative zero."""
+    return round(value, math.ceil(-math.log10(unit))) + 0.0
+
+
 def find_minima(values: Array) -> Array:
     """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]

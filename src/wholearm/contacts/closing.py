@@ -20,7 +20,7 @@ from ..common.errors import InputError
 from ..scene.model import Finger, Scene
 from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap, measure_gaps
 from .elemental import Contact, candidate_contacts
-from .formation import Formation, Kinematics
+from .formation import CurvePoint, Formation, Kinematics
 
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
@@ -265,7 +265,7 @@ def name_reach(scene: Scene, phi: float) -> str:
     return f"at that angle the hand closes for x {' and '.join(spans)}"
 
 
-def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
+def place_at(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]], z[:, 1], count = poses, 0.0, scene.polygon.n_vertices
@@ -286,14 +286,9 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     return z
 
 
-def move(
-    scene: Scene, labels: Numbers, poses: Array, rates: Array
-) -> tuple[Array, Array, Array, Kinematics]:
-    """Straight paths at poses (x, phi) with rates (x', phi'), (n, 2), and labels (n, 3).
-
-    Returns configurations z, their derivatives z' and z'' along the paths, (n, 5), and kinematics.
-    """
-    z = place(scene, labels, poses)
+def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> CurvePoint:
+    """Straight paths at poses (x, phi) with rates (x', phi'), (n, 2), and labels (n, 3)."""
+    z = place_at(scene, labels, poses)
     A = evaluate_each(scene, labels, z).A
     z_u, z_uu, levers = np.zeros_like(z), np.zeros_like(z), A[:, [1, 2], [3, 4]]
     z_u[:, [0, 2]], z_u[:, 1] = rates, -A[:, 0, 2] * rates[:, 1]
@@ -302,4 +297,4 @@ def move(
         at = evaluate_each(scene, labels, z, z_u)
         z_uu[:, 1] = -at.P_dot_v[:, 0]
         z_uu[:, 3:] = -(at.P_dot_v[:, 1:] + A[:, 1:, 1] * z_uu[:, 1:2]) / levers
-    return z, z_u, z_uu, at
+    return CurvePoint(z, z_u, z_uu, at)

@@ -86,16 +86,14 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
     ahead = {(index - (finger or 0)) % count for index in on_side}
     tips = [contact for contact in held if contact.surface == "tip"]
     behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
-    contacts = []
-    for contact in candidate_contacts(scene, finger):
-        if contact in held:
-            continue
+
+    def may_touch(contact: Contact) -> bool:
         on_tip = contact.surface == "tip"
-        if on_side and on_tip and not (contact.feature == "e" and contact.index in ahead):
-            continue
-        if tips and not on_side and (on_tip or contact.index not in behind):
-            continue
-        contacts.append(contact)
+        if on_side:
+            return not on_tip or (contact.feature == "e" and contact.index in ahead)
+        return not tips or (not on_tip and contact.index in behind)
+
+    contacts = [c for c in candidate_contacts(scene, finger) if c not in held and may_touch(c)]
     if finger is not None and not held:
         kinds = [("v", "back"), ("e", "joint"), ("v", "joint")]
         kinds = kinds if scene.fingers[finger].radius > 0 else kinds[:2]

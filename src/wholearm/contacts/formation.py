@@ -1,12 +1,8 @@
 """Contact formations: constraints P z' = 0 with their derivatives, and gap limits.
 
-With the rows of all contacts, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n]; sliding velocities are
-v_t = A_t z' with A_t = [W_t^T, -J_t]. Rolling contacts have v_t = 0 as well:
-
-    P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
-
-n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`elemental`), which
-keeps its value from where the rolling begins.
+Eq. (4) reads A z' = 0; sliding velocities are v_t = A_t z', zero for rolling contacts, so that P =
+[A; A_t(rolling)] (`mechanics/README.md`). Rolling is holonomic here: v_t is the rate of a slip
+coordinate (`elemental`), which keeps its value from where the rolling begins.
 """
 
 from __future__ import annotations
@@ -14,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -34,6 +30,24 @@ class Kinematics(NamedTuple):
     A_t: Array
     P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
     P_dot_v: Array  # (n, n_c + R): P' v for the velocities v that were given: P z'' = -P' z'
+
+    def pick(self, rows: Any) -> Kinematics:
+        """Those of some of the configurations."""
+        return Kinematics(*(array[rows] for array in self))
+
+
+class CurvePoint(NamedTuple):
+    """Curve at n places: z, tangent z_s and curvature z_ss, (n, 5) each, and kinematics there."""
+
+    z: Array
+    z_s: Array
+    z_ss: Array
+    kinematics: Kinematics
+
+    def pick(self, rows: Any) -> CurvePoint:
+        """Some of the places."""
+        kinematics = self.kinematics.pick(rows)
+        return CurvePoint(self.z[rows], self.z_s[rows], self.z_ss[rows], kinematics)
 
 
 def _identify_limits(formation: Formation) -> Hashable:

@@ -11,24 +11,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array, Numbers, find_root
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import CurvePoint as CurvePoint
+from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, find_freedoms, metric_weights
 
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
-
-
-class CurvePoint(NamedTuple):
-    """Curve at n places: z, tangent z_s and curvature z_ss, (n, 5) each, and kinematics there."""
-
-    z: Array
-    z_s: Array
-    z_ss: Array
-    kinematics: Kinematics
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,9 +81,10 @@ class Piece:
     label: Numbers  # (6,)
 
 
-def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
-    """Labels of n poses inside cells, shape (n, 6); `NOWHERE` where a finger cannot close."""
-    return label_inside(scene, close_fingers(scene, x, phi))
+def label_cells(scene: Scene, poses: Array) -> Numbers:
+    """What touches at poses (x, phi) inside cells, shape (..., 3); `NOWHERE` out of reach."""
+    labels = label_inside(scene, close_fingers(scene, *poses.reshape(-1, 2).T))
+    return labels[:, [0, 2, 4]].reshape(*poses.shape[:-1], 3)
 
 
 def label_inside(scene: Scene, closed: ClosedFinger) -> Numbers:

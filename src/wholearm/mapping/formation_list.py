@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array, Numbers
+from ..common.arrays import Array, Numbers, round_to
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, describe_obstacle
@@ -22,7 +22,7 @@ from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
 from ..geometry.path_guess import STILL, find_end, guess_phase, is_inside
 from ..geometry.tracing import trace_phases
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import measure_speed
 from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
@@ -98,10 +98,8 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         if path.note:
             notes.append(f"leg {leg} goes through cells: {path.note}")
         for k, (stretch, end) in enumerate(walked):
-            contacts, before = (
-                set(stretch.contacts),
-                stretches[-1] if stretches and k == 0 else None,
-            )
+            contacts = set(stretch.contacts)
+            before = stretches[-1] if stretches and k == 0 else None
             # On a border a leg may continue the one before; a reversal is a new phase.
             if before is not None and len(contacts) == 4 and set(before.contacts) == contacts:
                 runs = (before.stop - before.start) * (stretch.stop - stretch.start)
@@ -221,8 +219,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
             for contacts, until in steps:
                 start = end
                 end = find_end(Phase(index + len(walked), Formation(scene, contacts), until), start)
-                moved = metric_weights(scene) @ (end - start) ** 2
-                if moved < (STILL * scene.scales.length) ** 2:
+                if measure_speed(scene, end - start) < STILL * scene.scales.length:
                     text = f"{until} holds already at {describe_pose(start)}"
                     raise InputError("", "", text)
                 stretch = Stretch(contacts, until, start[[0, 2]], end[[0, 2]])
@@ -284,9 +281,9 @@ def _list_steps(
 def end_at(scene: Scene, row: int, pose: Array) -> Until:
     """The end of a phase at x or phi of a pose, rounded as in problem files."""
     if row == 0:
-        digits = math.ceil(-math.log10(DIGITS * scene.scales.length))
-        return Until(coordinate="x", value=round(float(pose[0]), digits))
-    degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
+        x = round_to(float(pose[0]), DIGITS * scene.scales.length)
+        return Until(coordinate="x", value=x)
+    degrees = round_to(math.degrees(pose[1]), math.degrees(DIGITS))
     return Until(coordinate="phi", value=math.radians(degrees))
 
 
@@ -303,20 +300,15 @@ def split_leg(scene: Scene, leg: Leg) -> list[Part]:
     sign = 1 if leg.stop >= leg.start else -1
     # The start is that of the leg before, up to rounding.
     margins = (1e-4 * near, near)[::sign]
-    kept = [
-        piece
-        for piece in leg.pieces
-        if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
-    ]
-    reached = [float(s) for piece in kept for s in piece.places[[0, -1]]]
-    ends = [low + near, *reached, high - near]
+    spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in leg.pieces]
+    spans = [span for span in spans if span[2] > low + margins[0] and span[1] < high - margins[1]]
+    ends = [low + near, *(s for _, *both in spans for s in both), high - near]
     for before, after in zip(ends[::2], ends[1::2], strict=True):
         if after - before > 1e-6 * leg.near:
             pose = leg.at((before + after) / 2)
             text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
             text = text or "there the border has ended"
             raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
-    spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
     # The ends of shorter parts are one crossing.
     spans = [span for span in spans if span[2] - span[1] > 1e-3 * leg.near] or spans
     if sign < 0:

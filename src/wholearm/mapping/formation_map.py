@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_alike
 from ..contacts.elemental import Contact
-from ..contacts.formation import Kinematics
+from ..contacts.formation import CurvePoint, Kinematics
 from ..geometry.curve import solve_tangent
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights, reduced_inertia
@@ -148,7 +147,7 @@ def build_map(
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     tangents = np.zeros((len(z), len(WAYS), 5))
     tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
-    directions = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
+    directions = _check_motions(problem, labels, z, kinematics, tangents, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
     return FormationMap(problem, x, phi, *parts, places, *directions)
@@ -178,9 +177,8 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
         _, sizes, right = np.linalg.svd(kinematics.A / weights)
         z_s = right[:, -1] / weights
         z_s *= np.where(z_s[np.arange(len(rows)), rows] < 0, -1.0, 1.0)[:, None]
-        regular = sizes[:, -1] > REGULAR * sizes[:, 0]
-        tangents = np.stack([z_s, -z_s], axis=1)
-        motions = problem, chosen, z[flush], kinematics, regular, tangents, limit
+        z_s[~(sizes[:, -1] > REGULAR * sizes[:, 0])] = 0.0
+        motions = problem, chosen, z[flush], kinematics, np.stack([z_s, -z_s], axis=1), limit
         possible, flags[2, flush] = _check_motions(*motions)
         flags[:2, flush] = possible.T
     table, borders = contact_table(scene), []
@@ -221,39 +219,30 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
 
 
 def _check_motions(
-    problem: Problem,
-    labels: Numbers,
-    z: Array,
-    kinematics: Kinematics,
-    regular: Flags,
-    tangents: Array,
-    limit: float,
+    problem: Problem, labels: Numbers, z: Array, kinematics: Kinematics, ways: Array, limit: float
 ) -> tuple[Flags, Flags]:
-    """Whether quasistatic motions along `tangents`, (n, k, 5), are feasible, (n, k).
+    """Whether quasistatic motions along tangents `ways`, (n, k, 5), are feasible, (n, k).
 
     And whether one more would be, but contact forces are not unique, (n,): their uniqueness margin
-    is below the `limit`. What is not `regular` is left out.
+    is below the `limit`. Tangents that are zero are left out.
     """
-    scene = problem.scene
-    held, unique = np.zeros((2, *tangents.shape[:2]), dtype=bool)
-    for (formation, mine), k in product(group_alike(scene, labels), range(tangents.shape[1])):
-
-        def take(rows: Numbers, k: int = k) -> tuple[Kinematics, Array, Directions]:
-            part = Kinematics(*(array[rows] for array in kinematics))
-            return part, tangents[rows, k], Directions.of(part, tangents[rows, k])
-
-        rows = np.flatnonzero(mine & regular)
-        part, tangent, directions = take(rows)
-        if formation.n_constraints == 3:
-            wrench = force_rows(formation, part, directions)[:, :, :3]
-            rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
-            part, tangent, directions = take(rows)
-        forces = inverse(formation, z[rows], tangent, 0 * tangent, directions, part)
-        limits = InternalForceLimits.of(formation, forces, tangent[:, 3:])
-        still = np.zeros(len(rows))
-        low, high = limits.find_span(still, still, problem.epsilon)
-        held[rows, k] = low <= high
-        unique[rows, k] = find_minors(formation, part, directions.Xi).ratios >= limit
+    scene, regular = problem.scene, ways.any(axis=(1, 2))
+    held, unique = np.zeros((2, *ways.shape[:2]), dtype=bool)
+    for k, z_s in enumerate(ways.swapaxes(0, 1)):
+        every, of_all = CurvePoint(z, z_s, 0 * z, kinematics), Directions.of(kinematics, z_s)
+        for formation, mine in group_alike(scene, labels):
+            rows = np.flatnonzero(mine & regular)
+            if formation.n_constraints == 3:
+                wrench = force_rows(formation, kinematics, of_all)[rows, :, :3]
+                rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
+            point, directions = every.pick(rows), Directions(*(signs[rows] for signs in of_all))
+            forces = inverse(formation, point, directions)
+            limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
+            still = np.zeros(len(rows))
+            low, high = limits.find_span(still, still, problem.epsilon)
+            held[rows, k] = low <= high
+            minors = find_minors(formation, point.kinematics, directions.Xi)
+            unique[rows, k] = minors.ratios >= limit
     return held & unique, np.any(held & ~unique, axis=1)
 
 
@@ -305,21 +294,20 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     motion keeps the limits, friction jams or contact forces are not unique. Limits are kept at one
     place of each interval, with any internal force.
     """
-    durations = np.full((len(borders), 2), np.inf)
     if not borders:
-        return durations
+        return np.zeros((0, 2))
     scene, weights = problem.scene, metric_weights(problem.scene)
     (steps, places, part), table = make_cosine_grid(NODES), contact_table(scene)
     every = []
-    for border in borders:
-        chords = np.diff(border.z, axis=0)
+    for points in (each for border in borders for each in (border.z, border.z[::-1])):
+        chords = np.diff(points, axis=0)
         arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
         s = places * arcs[-1]
-        z = interpolate(s, arcs, border.z)
+        z = interpolate(s, arcs, points)
         every.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
     z, chord, length = (np.concatenate(column) for column in zip(*every, strict=True))
     indices = [[table.index(contact) for contact in border.contacts] for border in borders]
-    labels = np.repeat(np.array(indices), NODES, axis=0)
+    labels = np.repeat(np.array(indices), 2 * NODES, axis=0)
     # One Newton step: between points of the map the contacts do not quite close.
     at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
@@ -327,22 +315,19 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     at = evaluate_each(scene, labels, z, run)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
     # With the share of length as path parameter.
-    tangent, curvature = length * z_s, length**2 * z_ss
+    whole, durations = CurvePoint(z, length * z_s, length**2 * z_ss, at), np.empty(2 * len(borders))
     for formation, mine in group_alike(scene, labels):
-        kinematics = Kinematics(*(array[mine] for array in at))
-        every_limit = make_limits(formation, problem.epsilon)
-        for back, sign in enumerate((1, -1)):
-            turned = sign * tangent[mine]
-            directions = Directions.of(kinematics, turned)
-            forces = inverse(formation, z[mine], turned, curvature[mine], directions, kinematics)
-            rows, cap = PathLimits.of(every_limit, forces, turned[:, 3:], GIVE).eliminate()
-            inertia = reduced_inertia(formation, kinematics, directions)
-            ratios = find_minors(formation, kinematics, directions.Xi).ratios
-            # No motion passes where b <= 0.
-            closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-            rows[closed], cap[closed] = 0.0, 0.0
-            rows = rows.reshape(-1, NODES, *rows.shape[1:])[:, ::sign]
-            limits = PathLimits(rows, cap.reshape(-1, NODES)[:, ::sign])
-            motion = speed_sweep(limits, steps, part, sweeps=2)
-            durations[mine[::NODES], back] = motion.find_durations(steps)
-    return durations
+        point = whole.pick(mine)
+        directions = Directions.of(point.kinematics, point.z_s)
+        forces = inverse(formation, point, directions)
+        limits = make_limits(formation, problem.epsilon)
+        rows, cap = PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
+        inertia = reduced_inertia(formation, point.kinematics, directions)
+        ratios = find_minors(formation, point.kinematics, directions.Xi).ratios
+        # No motion passes where b <= 0.
+        closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
+        rows[closed], cap[closed] = 0.0, 0.0
+        on_paths = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
+        motion = speed_sweep(on_paths, steps, part, sweeps=2)
+        durations[mine[::NODES]] = motion.find_durations(steps)
+    return durations.reshape(-1, 2)

@@ -1,16 +1,11 @@
 """The constrained equations of motion of object and fingers, forward and inverse.
 
-Eqs. (1)-(4) are together (notation: `README.md`)
+Eqs. (1)-(4) are together (notation: `README.md`), with b = B z' + D sigma of the joints' friction,
 
-    M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0,   P = [A; A_t(rolling)],
+    M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0.
 
-where b = B z' + D sigma is joint friction, sigma the directions of the joints and S = [0; I]. The
-contact forces c = [c_n; c_t(rolling)] are as many as the constraints, n_c + R, and
-
-    G = [A - U Xi A_t; A_t(rolling)],  with zero for U Xi of a rolling contact,
-
-are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Three
-routes through the equations:
+A sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free, in c. Three routes
+through the equations:
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
@@ -31,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import CurvePoint, Formation, Kinematics
 from ..scene.model import Scene
 
 Fixed = tuple[tuple[int, float | Array], ...]
@@ -120,22 +115,14 @@ def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Di
         )
 
 
-def inverse(
-    formation: Formation,
-    z: Array,
-    z_s: Array,
-    z_ss: Array,
-    directions: Directions,
-    kinematics: Kinematics | None = None,
-) -> PathForces:
+def inverse(formation: Formation, point: CurvePoint, directions: Directions) -> PathForces:
     """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
     number: the internal force lambda along a unit null vector; three leave none. `directions` are
     signs for motion along +s, in one row or n.
     """
-    scene = formation.scene
-    kinematics = kinematics or formation.evaluate(z, z_s)
+    scene, (z, z_s, z_ss, kinematics) = formation.scene, point
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     mass, count = scene.mass_diagonal, wrench.shape[2]
@@ -202,7 +189,7 @@ def find_freedoms(P: Array, metric: Array, least: float) -> Array:
 
 
 def measure_speed(scene: Scene, v: Array) -> float:
-    """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
+    """Size of a velocity [m/s] or displacement [m], shape (5,), in the metric of curves."""
     return float(np.sqrt(metric_weights(scene) @ v**2))
 
 

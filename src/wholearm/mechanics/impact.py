@@ -1,11 +1,6 @@
 """Plastic impacts: projection of the velocity onto the next formation, by impulses with friction.
 
-With v- and v+ the velocities z' before and after and the rows P and G of the new formation
-(`mechanics.dynamics`), G with the sliding signs Xi of v+,
-
-    M5 (v+ - v-) = G^T p,   P v+ = 0.
-
-The impulses p obey the inequalities of c: every contact presses, rolling ones stay in their cones.
+Equations: `README.md`, with P of rolling contacts in place of A; their impulses stay in the cones.
 The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction.
 """
 

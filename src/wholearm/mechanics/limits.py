@@ -1,11 +1,7 @@
 """Motion limits, low <= rows (c, tau, theta') <= high: contact forces, torques and joint speeds.
 
-A rolling contact does not slip, with the same reserve epsilon as a sliding one has to press with:
-
-    c_n >= epsilon,    mu c_n - c_t >= mu epsilon,    mu c_n + c_t >= mu epsilon.
-
-Another limit takes another maker in `MAKERS`: planners, checks between nodes, tightening and advice
-go through a `LimitSet`.
+`README.md` lists them. Another limit takes another maker in `MAKERS`: planners, checks between
+nodes, tightening and advice go through a `LimitSet`.
 """
 
 from __future__ import annotations

@@ -22,12 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import CurvePoint, Formation, Kinematics
 from .dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights, move_least
 
 COUNT = 5  # number of coefficients: of 1, a, b, s' and the internal force
-CurvePlaces = tuple[Array, Array, Array, Kinematics]
-"""z, tangent z_s and curvature z_ss at n places of a curve, (n, 5) each, and kinematics there."""
 
 
 def find_slopes_at(
@@ -72,7 +70,7 @@ class Sensitivity(NamedTuple):
 
     @staticmethod
     def of_curve(
-        formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces
+        formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces
     ) -> Sensitivity:
         """At n places of a curve, with coefficients of (1, a, b, s', lambda)."""
         z, z_s, z_ss, kinematics = point

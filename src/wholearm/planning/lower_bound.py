@@ -110,7 +110,7 @@ class PathTerms:
 
 def find_limits(curve: Curve, epsilon: float, point: CurvePoint, segment: Numbers) -> PathLimits:
     """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
-    forces = inverse(curve.formation, *point[:3], directions_of(curve, segment), point.kinematics)
+    forces = inverse(curve.formation, point, directions_of(curve, segment))
     limits = make_limits(curve.formation, epsilon)
     return PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
 

@@ -114,7 +114,7 @@ def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
     """
     formation, point, torque = after.formation, after.evaluate(np.zeros(1)), rows.torque[-1:]
     directions = directions_of(after, np.zeros(1, dtype=np.int64))
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     limits = split_limits(formation)[0]
     slack = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
     beyond = np.tile(UNLIMITED, (len(rows.s), slack.shape[1], 1))
@@ -133,7 +133,7 @@ def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
 def find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
     """Torques at n places, shape (n, 2, 5)."""
     point = curve.evaluate(np.clip(s, 0.0, curve.length))
-    return inverse(curve.formation, *point[:3], directions, point.kinematics).of_tau
+    return inverse(curve.formation, point, directions).of_tau
 
 
 def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
@@ -169,7 +169,7 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     (contact, joint), rates = split_limits(formation), point.z_s[:, 3:]
     levels = list[Array]()
     for side in sides:
-        forces = inverse(formation, *point[:3], side, point.kinematics)
+        forces = inverse(formation, point, side)
         c = respond(forces, torque)[0]
         slack = measure_slack(contact, c, torque, rates)
         state = Sensitivity.of_curve(formation, point, side, forces)
@@ -240,10 +240,10 @@ def find_corners(
     torque, late, slope = torques
     for scene in list_scenes(formation.scene, widths):
         changed = replace(formation, scene=scene)
-        c, motion = respond(inverse(changed, *point[:3], side, point.kinematics), torque)
+        c, motion = respond(inverse(changed, point, side), torque)
         rows.append(measure_slack(split_limits(changed)[0], c, torque, point.z_s[:, 3:]))
         moves.append(motion[:, 0])
-    nominal = inverse(formation, *point[:3], side, point.kinematics)
+    nominal = inverse(formation, point, side)
     swings = [respond(nominal, late)[0] - respond(nominal, torque)[0]]
     first_order = (*GROUPS["geometry"], *GROUPS["gain"])
     state = Sensitivity.of_curve(formation, point, side, nominal)
@@ -539,7 +539,7 @@ def _follow(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array
     v = (point.z_s * plan.z_dot[rows]) @ metric
     a = (point.z_s * plan.z_ddot[rows]) @ metric
     segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
-    forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
+    forces = inverse(formation, point, directions_of(curve, segment))
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
     c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
@@ -558,7 +558,7 @@ def _tabulate_curve(pieces: Sequence[ReferencePiece], push: Array, keeps: bool) 
         rows, curve, formation = piece.rows, piece.curve, piece.curve.formation
         point = curve.evaluate(rows.s)
         mean = blend_directions(curve, rows.s, np.sqrt(piece.b) * SETTINGS.near)[0]
-        forces = inverse(formation, *point[:3], mean, point.kinematics)
+        forces = inverse(formation, point, mean)
         levels = np.tile(UNLIMITED, (len(rows.s), most, 1))
         levels[:, : rows.levels.shape[1]] = rows.levels
         tables = levels, rows.torque, forces.of_c[:, : formation.n_contacts]

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
-from ..contacts.formation import Formation
+from ..contacts.formation import CurvePoint, Formation
 from ..geometry.tracing import runs_on_curves, split_blocks
 from ..mechanics.dynamics import (
     LAMBDA,
@@ -169,7 +169,7 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         z, v = samples.z, samples.z_dot
         kinematics = formation.evaluate(z, v)
         acceleration, _ = forward(formation, kinematics, v, plan.torque.at(times), directions)
-        forces = inverse(formation, z, v, acceleration, directions, kinematics)
+        forces = inverse(formation, CurvePoint(z, v, acceleration, kinematics), directions)
         limits = make_limits(formation, 0.0).without(SPEED)
         weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
         torque = np.isin(limits.sides[0], limits.of(TORQUE))

@@ -28,8 +28,7 @@ from ..common.fields import (
 )
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..scene.model import EPSILON, PLACE, SETTLE, TURN, Friction, Scene
-from ..scene.model import SETTLE_GAP as GAP_RANGE
+from ..scene.model import EPSILON, PLACE, SETTLE, SETTLE_GAP, TURN, Friction, Scene
 
 ROWS = {"x": 0, "phi": 2}  # rows of z that may be given where a phase ends
 
@@ -232,7 +231,7 @@ class Goal:
         'motion\'s time for all of them, such as "10 %".',
         *(DWELL, "time", SETTLE),
     ),
-    key("settle_gap", "From how far open they then close [m].", POSITIVE, "length", GAP_RANGE),
+    key("settle_gap", "From how far open they then close [m].", POSITIVE, "length", SETTLE_GAP),
 )
 @dataclass(frozen=True, eq=False)
 class Problem:

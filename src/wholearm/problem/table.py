@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
 
 
-SAME = 9  # decimals of an angle in degrees that a printed phase has at most
+PRINTED = 9  # decimals of an angle in degrees that a printed phase has at most
 NEEDED = {"settle_gap": "settle", "control_hold": "control_period"}
 """Keys of a file that have no effect without another one."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
@@ -112,10 +112,9 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         table["goal"] = goals[0] if len(goals) == 1 else goals
     elif problem.phases:
         table["phases"] = [describe_phase(phase) for phase in problem.phases]
-    for prefix, part in _list_parts(problem.scene):
-        for key, value, field in _list_values((prefix, part)):
-            if field.required or value != field.shown_default:
-                _set(table, key, value)
+    for key, value, field in _list_values(*_list_parts(problem.scene)):
+        if field.required or value != field.shown_default:
+            _set(table, key, value)
     for key, needed in NEEDED.items():
         if key in table:
             table.setdefault(needed, 0.0)
@@ -191,7 +190,7 @@ def write_until(until: Until, digits: int) -> Any:
 
 def format_until(until: Until) -> str:
     """The value of `until` in a problem file, to read."""
-    return _write(write_until(until, SAME))
+    return _write(write_until(until, PRINTED))
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:

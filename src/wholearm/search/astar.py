@@ -111,6 +111,11 @@ class Route:
         steps = (step for edge in self.edges for step in edge.steps)
         return tuple((frozenset(step.contacts), step.end) for step in steps)
 
+    def has_followed(self, contacts: Sequence[Contact]) -> bool:
+        """Whether contacts are those of the border that it has just followed."""
+        last = self.edges[-1] if self.edges and not self.edges[-1].in_cell else None
+        return last is not None and set(last.steps[-1].contacts) == set(contacts)
+
 
 @dataclass(eq=False)
 class RouteSearch:
@@ -174,7 +179,7 @@ class RouteSearch:
             times[place.key] += 1
             self.reached.setdefault(place.key, route)
             for candidate in self.roadmap.set_out(place, self.goal):
-                if self._is_back(route, candidate.steps[0].contacts):
+                if route.has_followed(candidate.steps[0].contacts):
                     continue
                 if isinstance(candidate, Edge):
                     push(route.extend(candidate))
@@ -182,18 +187,11 @@ class RouteSearch:
                     self.blocked.append(candidate)
             if not place.landed:
                 every = (chain.borders[0] for chain in self.roadmap.follow(place))
-                borders = [b for b in every if not self._is_back(route, b.formation.contacts)]
+                borders = [b for b in every if not route.has_followed(b.formation.contacts)]
                 for border in borders:
                     release = partial(self.roadmap.release, border, borders)
                     push(route, release, heuristic.leaving * time)
                 push(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
-
-    @staticmethod
-    def _is_back(route: Route, contacts: Sequence[Contact]) -> bool:
-        """Whether contacts are those of the border that a route has just followed."""
-        if not route.edges or route.edges[-1].in_cell:
-            return False
-        return set(route.edges[-1].steps[-1].contacts) == set(contacts)
 
 
 class RefinedPath(NamedTuple):
@@ -314,10 +312,8 @@ class RoutePlanner:
         """
         self.thorough, plans = True, self.roadmap.coarse_plans
         # For a phase alone, as after a stop, they have been tried.
-        counts = (
-            (e, made, len(e.steps) - (e.steps[0].end is End.REST)) for e, made in plans.items()
-        )
-        lost = [edge for edge, made, count in counts if not made and count > 1]
+        failed = [edge for edge, made in plans.items() if not made]
+        lost = [e for e in failed if len(e.steps) - (e.steps[0].end is End.REST) > 1]
         for edge in lost:
             del plans[edge]
         self.search.found.clear()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from ..mechanics.limits import EPSILON, make_limits
 from ..planning.explain import change_curve, find_changes, list_frictions, unadvised
 from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
-from ..problem.definition import Goal, Phase, Problem
+from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
 from .astar import EAGER, Route, RoutePlanner, RouteSearch
 from .edge_plans import ROUGH
@@ -49,13 +49,11 @@ class Opening(NamedTuple):
     """Values of a number that open borders."""
 
     parameter: Parameter
-    # for each of some borders the value with which it can be followed, NaN where there is none
-    values: tuple[float, ...]
+    values: dict[int, float]  # by the border's number, of those that it opens
 
-    def open_all(self, among: Sequence[int] | None = None) -> Change:
-        """The least change that opens all borders, or some, which the number can open."""
-        chosen = self.values if among is None else [self.values[k] for k in among]
-        values = [value for value in chosen if not math.isnan(value)]
+    def open_all(self, among: Collection[int]) -> Change:
+        """The least change that opens all borders of some that the number can open."""
+        values = [value for k, value in self.values.items() if k in among]
         return Change(self.parameter, max(values) if self.parameter.sign > 0 else min(values))
 
 
@@ -81,7 +79,7 @@ def list_cut(search: RouteSearch) -> list[Blocked]:
 
 def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
-    by_key: dict[str, tuple[Parameter, list[float]]] = {}
+    by_key = dict[str, Opening]()
     for index, cut in enumerate(cuts):
         formation, epsilon = cut.border.formation, cut.border.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
@@ -92,15 +90,13 @@ def list_openings(cuts: Sequence[Blocked]) -> list[Opening]:
                 return isinstance(edge_changed(cut, Change(number, value)), Edge)
 
             for change in find_changes([number], {number: tried}.__getitem__, opens):
-                _, values = by_key.setdefault(number.key, (number, [math.nan] * len(cuts)))
-                values[index] = change.value
-    openings = [Opening(number, tuple(values)) for number, values in by_key.values()]
+                by_key.setdefault(number.key, Opening(number, {})).values[index] = change.value
 
     def rank(opening: Opening) -> tuple[int, float]:
-        first = next(k for k, value in enumerate(opening.values) if not math.isnan(value))
+        first = min(opening.values)
         return first, abs(opening.values[first] / opening.parameter.value - 1)
 
-    return sorted(openings, key=rank)
+    return sorted(by_key.values(), key=rank)
 
 
 def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
@@ -113,31 +109,26 @@ def edge_changed(blocked: Blocked, change: Change) -> Edge | Blocked:
     return Chain((border,)).stop_at(blocked.steps[0].until)
 
 
-def find_opening(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
+def find_opening(planner: RoutePlanner, seconds: float) -> tuple[str, tuple[Change, ...]]:
     """The change of a single number with which the goal is reached, in words and as such.
 
     It is looked for on the borders that are shut, and tried by a search beyond those that it opens;
-    then among other lengths and places of the fingers. The `search` that did not reach the goal has
-    taken `seconds` of processor time.
+    then among other lengths and places of the fingers. The search of the `planner`, which did not
+    reach the goal, has taken `seconds` of processor time.
     """
-    report("looking for a number that opens the way")
-    cuts, tried = list_cut(search)[:CUT], list[str]()
+    planner.report("looking for a number that opens the way")
+    search, tried = planner.search, list[str]()
+    cuts = list_cut(search)[:CUT]
 
     def find(opening: Opening, change: Change, planned: bool) -> tuple[float, Sequence[int]] | None:
         """About how long a route beyond opened borders takes [s], and which of them it crosses."""
         try:
-            changed = problem.with_(change.values)
+            changed = planner.problem.with_(change.values)
         except InputError:
             return None
         lasts, sources = dict[int, Edge](), list[Route]()
-        for k, value in enumerate(opening.values):
-            if not opening.parameter.sign * (change.value - value) >= 0:
+        for k, value in opening.values.items():
+            if opening.parameter.sign * (change.value - value) < 0:
                 continue
             before = search.reached.get(cuts[k].start.key)
             edge = edge_changed(cuts[k], change)
@@ -146,11 +137,11 @@ def find_opening(
                 sources.append(before.extend(edge))
         if not sources:
             return None
-        result = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
+        result = _search_changed(planner, changed, search.start.z, planned, sources)
         return result and (result[1], [k for k, edge in lasts.items() if edge in result[0].edges])
 
     for opening in list_openings(cuts)[:TRIED]:
-        most = opening.open_all()
+        most = opening.open_all(opening.values)
         route = find(opening, most, False)
         # Borders beyond those that the route crosses may need the larger change.
         least = most if route is None else opening.open_all(route[1])
@@ -159,7 +150,7 @@ def find_opening(
             if reached is not None:
                 return _describe_reached(change, reached[0]), (change,)
         tried.append(str(most))
-    text, changes = find_hand(search, problem, options, seconds, report)
+    text, changes = find_hand(planner, seconds)
     if tried and not changes:
         text = f"the goal is not reached with {', nor with '.join(tried)}; {text}"
     return text, changes
@@ -170,18 +161,17 @@ def _describe_reached(change: Change, duration: float) -> str:
 
 
 def _search_changed(
+    planner: RoutePlanner,
     changed: Problem,
     z: Array,
-    goal: Goal,
-    options: PlanOptions,
     planned: bool,
     sources: Sequence[Route] = (),
     most: int = NEARBY,
 ) -> tuple[Route, float] | None:
     """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
-    changed = replace(changed, start=z)
-    roadmap = Roadmap(changed, options.uniqueness_margin)
-    search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
+    changed, options = replace(changed, start=z), planner.options
+    roadmap, start = Roadmap(changed, options.uniqueness_margin), make_place(changed.scene, z)
+    search = RouteSearch(roadmap, start, planner.search.goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
     planner = RoutePlanner(changed, None, search, rough, Reporter(None), first_only=True)
@@ -195,32 +185,25 @@ def _search_changed(
     return (planner.made[0][1], planner.made[0][0].duration) if planner.made else None
 
 
-def find_hand(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
+def find_hand(planner: RoutePlanner, seconds: float) -> tuple[str, tuple[Change, ...]]:
     """The least change of `list_hands` with which the goal is reached from the same pose."""
-    tried, ended = 0, "; the time for such trials is over"
+    search, tried, ended = planner.search, 0, "; the time for such trials is over"
     stop = time.process_time() + max(TIMES * seconds, AT_LEAST)
     with suppress(OutOfTime):
-        for change in list_hands(problem.scene):
+        for change in list_hands(planner.problem.scene):
             if time.process_time() > stop:
                 break
-            report(f"looking for routes with {change}")
+            planner.report(f"looking for routes with {change}")
             tried += 1
             try:
-                changed = problem.with_(change.values)
+                changed = planner.problem.with_(change.values)
                 require_reach(changed.scene, search.goal, float(search.start.z[2]))
             except (InputError, InfeasibleError):
                 continue
             closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
             if closed.obstacle.any():
                 continue
-            z, goal = closed.z[0], search.goal
-            result = _search_changed(changed, z, goal, options, True, most=EAGER.most)
+            result = _search_changed(planner, changed, closed.z[0], True, most=EAGER.most)
             if result is not None:
                 return _describe_reached(change, result[1]), (change,)
         else:

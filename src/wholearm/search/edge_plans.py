@@ -15,13 +15,13 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, round_to
 from ..common.errors import InputError, SolverError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import CostToGo, find_headings, split_blocks, trace_phase
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import measure_speed
 from ..planning.blocks import (
     BlockPlan,
     ImpactSequence,
@@ -38,8 +38,7 @@ from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
-from ..problem.table import SAME as PRINTED_ANGLE
-from ..problem.table import describe_phase
+from ..problem.table import PRINTED, describe_phase
 from ..results.trajectory import ROLLS
 from ..scene.model import Scene
 from .edges import DEPENDENT, Edge, EdgeStep, describe_steps, point_out
@@ -108,14 +107,12 @@ def plan_coarsely(
             curve = trace_phase(phases[0], z)
             spent = ImpactSequence(phases[:1], [curve]).estimate(problem.epsilon)
             z, phases = curve.end, phases[1:]
-        goal = close_place(edge.stop) if len(phases) == 1 else None
-        if goal is None:
-            goal = replace(edge.stop, z=find_end(phases[0], z, phases[1:]))
-        moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
-        if moved < (STILL * problem.scene.scales.length) ** 2:
-            return None  # `until` holds already where it starts.
         alone = len(phases) == 1
-        towards = goal.z if straight and alone else None
+        closed = close_place(edge.stop) if alone else None
+        goal = closed.z if closed else find_end(phases[0], z, phases[1:])
+        if measure_speed(problem.scene, goal - z) < STILL * problem.scene.scales.length:
+            return None  # `until` holds already where it starts.
+        towards = goal if straight and alone else None
         given = list[PhasePlan[TimeMotion]]()
         if stopped is not None:
             (first,) = make_phases(problem, stopped.steps[:1])
@@ -171,7 +168,7 @@ def list_printed(
     for phase, motion in planned:
         if guesses and motion:
             phase = replace(phase, guess=_list_modes(motion, scene.scales.length))
-        phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED_ANGLE)))
+        phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED)))
     return tuple(phases)
 
 
@@ -184,16 +181,11 @@ def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
         count = math.ceil(POSES * (span.stop - span.start) / motion.duration)
         for time in np.linspace(span.start, span.stop, count + 1)[1:].tolist():
             x, _, phi, *_ = motion.evaluate(np.array([time])).z[0].tolist()
-            t, x = _round(time, GUESSED * motion.duration), _round(x, GUESSED * length)
+            t, x = round_to(time, GUESSED * motion.duration), round_to(x, GUESSED * length)
             # In degrees, as it is printed.
-            phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
+            phi = math.radians(round_to(math.degrees(phi), math.degrees(GUESSED)))
             modes.append(ModeGuess(t, x, phi, signs))
     return tuple(modes)
-
-
-def _round(value: float, unit: float) -> float:
-    """A value with the decimals of a unit, and no negative zero."""
-    return round(value, math.ceil(-math.log10(unit))) + 0.0
 
 
 def split_route(edges: Sequence[Edge]) -> list[list[Edge]]:
@@ -269,7 +261,7 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     length = formation.scene.scales.length
     x, _, phi, *_ = np.abs(find_headings(formation.add(until.contact), z) or np.eye(5))[0]
     name, digits = ("x", length) if x > length * phi else ("phi", 1.0)
-    value = _round(float(z[ROWS[name]]), PINNED * digits)
+    value = round_to(float(z[ROWS[name]]), PINNED * digits)
     return replace(phase, until=replace(until, pins=((name, value),)))
 
 
@@ -306,7 +298,7 @@ def _aim(phase: Phase, z: Array, edge: Edge) -> Phase:
     """
     try:
         away, scene = trace_phase(phase, z).end - edge.stop.z, edge.stop.scene
-        if away**2 @ metric_weights(scene) <= (OFF * scene.scales.length) ** 2:
+        if measure_speed(scene, away) <= OFF * scene.scales.length:
             return phase
     except InputError:
         pass

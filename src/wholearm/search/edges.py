@@ -11,8 +11,8 @@ import numpy as np
 
 from ..common.arrays import Array, Numbers
 from ..contacts.elemental import Contact
-from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of
+from ..contacts.formation import CurvePoint, Formation
+from ..geometry.curve import Curve, describe_pose, directions_of
 from ..geometry.tracing import HELD, find_headings, trace_curve
 from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
@@ -215,9 +215,7 @@ class BorderEdge:
         try:
             at = curve.evaluate(s)
             closed, clear = _find_ambiguity(curve, s, at, owners, self.uniqueness_margin)
-            first = Kinematics(*(array[:count] for array in at.kinematics))
-            nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
-            limits = find_limits(curve, self.epsilon, nodes_at, owners[:count])
+            limits = find_limits(curve, self.epsilon, at.pick(slice(count)), owners[:count])
         except np.linalg.LinAlgError:
             z, none = np.zeros((len(steps), 5)), np.zeros(len(steps))
             limits = PathLimits(np.zeros((len(steps), 1, 4)), none)

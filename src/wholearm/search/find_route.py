@@ -32,7 +32,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
-from ..problem.table import SAME, describe_phase, describe_scene, write_toml
+from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
 from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edges import Blocked
@@ -208,11 +208,10 @@ def _explain(
     planner: RoutePlanner, seconds: float, hurry: Callable[[], None] | None
 ) -> InfeasibleError:
     """Why nothing leads to a goal, after so many seconds of search [s]."""
-    search, problem, options = planner.search, planner.problem, planner.options
-    opening, changes, text = "", tuple[Change, ...](), ""
+    search, opening, changes, text = planner.search, "", tuple[Change, ...](), ""
     with _ending(hurry):
-        opening, changes = find_opening(search, problem, options, seconds, planner.report)
-        explain = partial(explain_block, problem, options)
+        opening, changes = find_opening(planner, seconds)
+        explain = partial(explain_block, planner.problem, planner.options)
         text = describe_block(search, planner.failures, opening, explain)
     text = text or describe_block(search, planner.failures, opening)
     return InfeasibleError(text, changes=changes)
@@ -367,4 +366,4 @@ class Answer(Alternative):
 
 def format_phases(problem: Problem) -> str:
     """The phases of a problem as `[[phases]]` of a problem file."""
-    return write_toml({"phases": [describe_phase(phase, SAME) for phase in problem.phases]})[1:]
+    return write_toml({"phases": [describe_phase(phase, PRINTED) for phase in problem.phases]})[1:]

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..common.arrays import Array, Flags, Numbers
-from ..contacts.closing import contact_table, first_contact, move
-from ..contacts.closing import place as place_at
+from ..contacts.closing import contact_table, first_contact, move, place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.path_guess import is_inside
@@ -72,8 +71,9 @@ def evaluate_paths(
 ) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
     formation, limits = _make_limits(scene, epsilon)
-    z, z_u, z_uu, kinematics = move(scene, labels, poses, runs)
-    directions = Directions.of(kinematics, z_u)
+    point = move(scene, labels, poses, runs)
+    kinematics, rates = point.kinematics, point.z_s
+    directions = Directions.of(kinematics, rates)
     # Rounding makes dependent wrenches independent by a hair (goal 12): a margin tells them.
     wrenches = force_rows(formation, kinematics, directions)[:, :, :3]
     wrenches /= [1.0, 1.0, scene.scales.length]
@@ -81,8 +81,8 @@ def evaluate_paths(
     with np.errstate(invalid="ignore"):
         held = np.asarray(np.abs(np.linalg.det(wrenches)) > 1e-9 * sizes)
     kinematics = kinematics._replace(A=np.where(held[:, None, None], kinematics.A, np.nan))
-    forces = inverse(formation, z, z_u, z_uu, directions, kinematics)
-    rows, cap = PathLimits.of(limits, forces, z_u[:, 3:], GIVE)
+    forces = inverse(formation, point._replace(kinematics=kinematics), directions)
+    rows, cap = PathLimits.of(limits, forces, rates[:, 3:], GIVE)
     # No motion where three contacts cannot balance the object, or a finger cannot reach it.
     held &= np.isfinite(rows).all(axis=(1, 2))
     rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])
@@ -265,8 +265,7 @@ class Roadmap:
         begin = np.broadcast_to(place.z[[0, 2]], poses.shape)
         middles = begin[:, None] + MIDDLES[:, None] * (poses - begin)[:, None]
         passed = np.concatenate([middles, poses[:, None]], axis=1)
-        seen = label_cells(scene, *passed.reshape(-1, 2).T)[:, [0, 2, 4]]
-        seen = seen.reshape(*passed.shape[:2], 3)
+        seen = label_cells(scene, passed)
         far = np.abs((poses - begin) / [scene.scales.length, 1.0]).max(axis=1) > NEAREST
         for formation in list_formations_at(place, 3):
             label = np.array([table.index(contact) for contact in formation.contacts])
@@ -285,14 +284,16 @@ class Roadmap:
 def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
     """The fastest straight path through each cell to each contact, from places of one scene."""
     scene = places[0].scene
-    cells, held = _list_cells(places)
+    table = contact_table(scene)
+    # What touches at each place; the last column is that of `NOWHERE`.
+    held = np.array([[*(contact in at.contacts for contact in table), False] for at in places])
     angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
     headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
     sources = np.repeat(np.arange(len(places)), HEADINGS)
     starts = np.array([place.z[[0, 2]] for place in places])[sources]
     runs = np.tile(headings, (len(places), 1))
-    labels = label_cells(scene, *(starts + FIRST * runs).T)[:, [0, 2, 4]]
-    kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
+    labels = label_cells(scene, starts + FIRST * runs)
+    kept = np.flatnonzero(held[sources[:, None], labels].all(axis=1))
     rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
     if len(rays.sources):
         limits = evaluate_paths(scene, epsilon, rays.labels, rays.starts, rays.runs)
@@ -307,8 +308,7 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Edge]:
         if key not in best or times[k] < TIED * times[best[key]]:
             best[key] = k
     chosen = [best[key] for key in sorted(best)]
-    z, table = place_at(scene, rays.labels[chosen], rays.ends[chosen]), contact_table(scene)
-    edges = list[Edge]()
+    z, edges = place_at(scene, rays.labels[chosen], rays.ends[chosen]), list[Edge]()
     for k, end in zip(chosen, z, strict=True):
         contacts, gained = tuple(table[c] for c in rays.labels[k]), table[rays.gained[k]]
         step, start = EdgeStep(contacts, Until(contact=gained)), places[rays.sources[k]]
@@ -348,8 +348,7 @@ def _find_exits(scene: Scene, rays: Rays) -> tuple[Array, Numbers]:
         """Go on by steps, `count` at most, while the label is that of the ray."""
         ahead = s[rows] + step * np.arange(1, count + 1)
         poses = rays.starts[rows, None] + ahead[..., None] * rays.runs[rows, None]
-        labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
-        labels = labels.reshape(*ahead.shape, 3)
+        labels = label_cells(scene, poses)
         outside = (labels != rays.labels[rows, None]).any(axis=2)
         k = np.where(outside.any(axis=1), outside.argmax(axis=1), count)
         after[rows] = labels[np.arange(len(rows)), np.minimum(k, count - 1)]
@@ -363,12 +362,15 @@ def _find_exits(scene: Scene, rays: Rays) -> tuple[Array, Numbers]:
     return s, after
 
 
-def _gain(scene: Scene, rays: Rays, held: Numbers) -> Rays:
-    """Rays that gain a new contact at their ends, of those with labels in place of the gained."""
+def _gain(scene: Scene, rays: Rays, held: Flags) -> Rays:
+    """Rays that gain a new contact at their ends, of those with labels in place of the gained.
+
+    Contacts `held` where they start are not new.
+    """
     part = (rays.gained != rays.labels).argmax(axis=1)[:, None]
     one = (rays.gained != rays.labels).sum(axis=1) == 1
     before, gained = (np.take_along_axis(x, part, 1)[:, 0] for x in (rays.labels, rays.gained))
-    new = one & (gained != NOWHERE) & (held[rays.sources] != gained[:, None]).all(axis=1)
+    new = one & (gained != NOWHERE) & ~held[rays.sources, gained]
     new &= ~_list_renamed(scene)[gained, before]
     rays = rays.pick(new)._replace(gained=gained[new])
     # Where a finger passes the end of an edge, its first touch jumps.
@@ -376,19 +378,6 @@ def _gain(scene: Scene, rays: Rays, held: Numbers) -> Rays:
     np.put_along_axis(after, part[new], rays.gained[:, None], axis=1)
     jump = place_at(scene, after, rays.ends) - place_at(scene, rays.labels, rays.ends)
     return rays.pick(np.abs(jump[:, 3:]).max(axis=1, initial=0.0) < JUMP)
-
-
-def _list_cells(places: Sequence[RoadmapPlace]) -> tuple[Numbers, Numbers]:
-    """Labels of the cells around places, shape (n, f, 3), and all contacts there, (n, c)."""
-    index = {contact: k for k, contact in enumerate(contact_table(places[0].scene))}
-    cells = [[cell.contacts for cell in list_formations_at(place, 3)] for place in places]
-    labels = np.full((len(places), max(map(len, cells)), 3), NOWHERE - 1)
-    held = np.full((len(places), max(len(place.contacts) for place in places)), NOWHERE - 1)
-    for k, place in enumerate(places):
-        for row, contacts in enumerate(cells[k]):
-            labels[k, row] = [index[contact] for contact in contacts]
-        held[k, : len(place.contacts)] = [index[contact] for contact in place.contacts]
-    return labels, held
 
 
 @lru_cache(maxsize=8)

@@ -15,7 +15,7 @@ from ..common.errors import InputError
 from ..common.fields import POSITIVE, declare, key, read_keys
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import FINGERS_TOUCH, evaluate_finger_gap
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import Formation
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import EndDistance
 from ..mechanics import UNIQUENESS
@@ -548,7 +548,7 @@ def find_uniqueness_margin(
     margins = []
     for pattern in sorted(set(map(tuple, slides.tolist()))):
         rows_of = np.flatnonzero((slides == pattern).all(axis=1))
-        part = Kinematics(*(array[rows_of] for array in kinematics))
+        part = kinematics.pick(rows_of)
         sticking = tuple(np.flatnonzero(np.logical_not(pattern)).tolist())
         ratio, names, row = find_minors(formation, part, Xi[rows_of], sticking).find_least()
         margins.append(results.UniquenessMargin(ratio, names, float(motion.t[rows[rows_of[row]]])))

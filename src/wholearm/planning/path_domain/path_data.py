@@ -150,7 +150,7 @@ def prepare(
             f"phase {phase}: {' '.join(formation.names)} jams at {describe_pose(point.z[worst])}: "
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     variations = np.zeros((len(s), 0))
     if spread is not None:
         variations = spread.find_variations(formation, point, directions, forces, epsilon)

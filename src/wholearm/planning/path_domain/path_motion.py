@@ -383,7 +383,7 @@ class PathMotion:
         point = self.curve.evaluate(s)
         directions = directions_of(self.curve, segment)
         formation = self.curve.formation
-        forces = inverse(formation, *point[:3], directions, point.kinematics)
+        forces = inverse(formation, point, directions)
         c_n, c_t = split_forces(formation, forces.c(a, b, lam), directions.Xi)
         acceleration = point.z_s * a[:, None] + point.z_ss * b[:, None]
         motion = point.z, point.z_s * np.sqrt(b)[:, None], acceleration

@@ -148,7 +148,7 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     segment = np.repeat(np.arange(len(segments)), _LOOKS)
     point = curve.evaluate(s)
     directions = directions_of(curve, segment)
-    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    forces = inverse(formation, point, directions)
     limits = make_limits(formation, epsilon).split(2)[0]
     rows = limits.only(PRESS, CONE).rows[:, :-4]
     none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)

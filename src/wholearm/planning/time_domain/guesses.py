@@ -21,7 +21,7 @@ import numpy as np
 from ...common.arrays import Array, find_runs, interpolate
 from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
-from ...contacts.formation import Formation
+from ...contacts.formation import CurvePoint, Formation
 from ...geometry.curve import describe_pose, find_tied, tangent_basis
 from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, is_inside, list_ends
 from ...mechanics.dynamics import (
@@ -397,8 +397,8 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
     runs = np.sqrt(dz**2 @ metric_weights(scene))[:, None]
     z_s, m = dz / runs, len(dz)
     z_ss = np.gradient(z_s, np.cumsum(runs) - runs[:, 0] / 2, axis=0)
-    kinematics = formation.evaluate(middles, z_s)
-    forces = inverse(formation, middles, z_s, z_ss, Directions.of(kinematics, z_s), kinematics)
+    point = CurvePoint(middles, z_s, z_ss, formation.evaluate(middles, z_s))
+    forces = inverse(formation, point, Directions.of(point.kinematics, z_s))
     limits = make_limits(formation, epsilon).without(SPEED)
     slack = find_slack_rows(limits, forces, z_s[:, 3:])
     # In the intervals, s'' and s'^2 of b over the scene's squared speed; the margin is the last.
