@@ -574,9 +574,9 @@ def _verify(options: argparse.Namespace) -> int:
     values = list_given(options, *keys)
     require_with(options, "free", "restitution", "policy")
     require_with(options, "policy", "sensor")
-    for key, value in {"--reduced": options.reduced, "--rest-speed": options.rest_speed}.items():
-        if value and options.free:
-            raise InputError("", key, "does not go with --free")
+    for key in ("reduced", "rest_speed", "uniqueness_margin") if options.free else ():
+        if getattr(options, key) not in (None, False):
+            raise InputError("", f"--{key.replace('_', '-')}", "does not go with --free")
     policy = None
     torques: wholearm.Trajectory | wholearm.TorqueProfile
     report: wholearm.Report | wholearm.FreeReport
@@ -780,19 +780,19 @@ def _map(options: argparse.Namespace) -> int:
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
     if phi and not 0 < phi[1] - phi[0] <= 360:
         raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
-    if poses:
-        radians = [(x, math.radians(angle)) for x, angle in poses]
-        formations = wholearm.list_formations(read_problem(options), *radians)
-        print(wholearm.format_route(formations), end="")
-        if options.output is None:
-            return 0
     output = options.output or f"map_{Path(options.problem).stem}.png"
-    require_output(output)
+    drawn = options.output is not None or not poses
+    if drawn:
+        require_output(output)
     problem, plan = read_problem(options), None
     if options.plan is not None:
         problem, plan, _ = load_plan(options, options.plan)
-    _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
-    print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
+    if poses:
+        radians = [(x, math.radians(angle)) for x, angle in poses]
+        print(wholearm.format_route(wholearm.list_formations(problem, *radians)), end="")
+    if drawn:
+        _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
+        print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
 
 
@@ -1100,8 +1100,7 @@ def _new(options: argparse.Namespace) -> int:
     require_writable(output)
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
-    size = {key: getattr(options, key) for key in ("polygon", "size", "mass")}
-    size = {key: value for key, value in size.items() if value is not None}
+    size = list_given(options, "polygon", "size", "mass")
     if text := options.vertices:
         for key in [key for key in size if key != "mass"]:
             raise InputError("", f"--{key}", f"{size[key]} given; --vertices has the corners")
