@@ -568,8 +568,8 @@ def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
             except NoMotionError:
                 expected.append(math.inf)
     found = time_borders(problem, [make_border(curve) for curve in curves])
-    # Twelve points and twenty-four intervals leave an error of a few in a hundred.
-    assert found.ravel() == pytest.approx(np.array(expected), rel=0.04)
+    # Twelve points and twenty-four intervals leave an error below one in a hundred.
+    assert found.ravel() == pytest.approx(np.array(expected), rel=0.01)
     assert np.isfinite(found[:, 0]).all()
 
 
