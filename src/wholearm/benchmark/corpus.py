@@ -174,7 +174,7 @@ def _verify(problem: Problem, what: Any) -> Row:
         "failed phase": report.failed_phase,
         "failures": [mask(text) for text in report.failures],
         "arrivals": [phase.arrival for phase in report.phases],
-        "least": [one.least for phase in report.phases if (one := phase.least_force)],
+        "least": [one.value for phase in report.phases if (one := phase.least_force)],
         "events": [change.time for change in report.changes],
         "kinds": [f"{change.phase} {change.what} {change.kind}" for change in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
