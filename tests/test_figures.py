@@ -806,7 +806,7 @@ def test_a_plan_says_what_it_is(made: Plan) -> None:
     arrivals = [phase.arrival for phase in made.replay.phases]
     assert arrivals == pytest.approx([phase.arrival for phase in report.phases])
     forces, torque = [phase.least_force for phase in report.phases], made.trajectory.torque
-    assert made.trajectory.least_forces == [(f.least, f.contact) for f in forces if f]
+    assert made.trajectory.least_forces == [force[:2] for force in forces if force]
     dense = np.abs(torque.at(np.linspace(0.0, made.duration, 9999))).max()
     assert max(made.trajectory.largest_torques) == pytest.approx(dense, rel=1e-3)
 

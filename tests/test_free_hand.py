@@ -299,8 +299,8 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert f"wrote {written}" in out and "the whole from the start, by the clock" in out
     assert main(["plot", written, "--simulate", "free", "-o", figure]) == 0
     assert Path(figure).stat().st_size > 10_000
-    for options in (["--reduced", "--free"], ["--restitution", "0.5"]):
-        assert main(["verify", path, given, *options]) == 2
+    for options in ("--reduced --free", "--restitution 0", "--uniqueness-margin 0 --free"):
+        assert main(["verify", path, given, *options.split()]) == 2
 
 
 def test_one_function_simulates_under_both_rules() -> None:

@@ -268,9 +268,9 @@ def test_constant_torques_do_not_come_to_rest() -> None:
 @each(
     "given, wrong",
     [
-        ({"stops": 8, "brake": True}, "stops: 8 given; allowed are 0 to 7"),
-        ({"stops": -1, "brake": True}, "allowed are 0 to 7"),
-        ({"stops": 1.5, "brake": True}, "allowed are 0 to 7"),
+        ({"stops": 8, "brake": True}, "stops: 8 given; allowed are whole numbers from 0 to 7"),
+        ({"stops": -1, "brake": True}, "from 0 to 7"),
+        ({"stops": 1.5, "brake": True}, "from 0 to 7"),
         ({"stops": 1}, "without a brake"),
         ({"share": 2.0}, "share: 2.0 given; allowed are 0 to 1"),
     ],

@@ -172,6 +172,6 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
         phase=0 if least is None else least.phase,
         lost=energy.viscous + energy.dry + energy.contact + energy.impact,
         lasts=tuple(math.nan if t is None else t - start for start, t in spans),
-        margins=tuple(math.nan if force is None else force.margin for force in forces),
+        margins=tuple(math.nan if f is None else f.value - report.epsilon for f in forces),
         report=report,
     )

@@ -17,7 +17,7 @@ import numpy as np
 from ..common.arrays import Array, find_root
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source
-from ..common.fields import SHARE
+from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
 from ..geometry.tracing import EndDistance
 from ..problem.definition import End, Phase, Problem, Until
@@ -267,9 +267,7 @@ def tune(
     """
     require_phases(problem)
     squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
-    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= SETTINGS.stops:
-        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {SETTINGS.stops}")
-    if stops and not brake:
+    if Range(0, SETTINGS.stops).read(stops, "stops") and not brake:
         raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
     options = TuningOptions(brake, squeeze, share, progress or (lambda text: None))
     tuned: list[PhaseTuning] = []

@@ -174,7 +174,7 @@ def _verify(problem: Problem, what: Any) -> Row:
         "failed phase": report.failed_phase,
         "failures": [mask(text) for text in report.failures],
         "arrivals": [phase.arrival for phase in report.phases],
-        "least": [one.least for phase in report.phases if (one := phase.least_force)],
+        "least": [one.value for phase in report.phases if (one := phase.least_force)],
         "events": [change.time for change in report.changes],
         "kinds": [f"{change.phase} {change.what} {change.kind}" for change in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
@@ -400,17 +400,15 @@ def _list(folder: Path, number: int) -> Row:
         problem = _load(folder, FOUR)
         places = (0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)
         route = wholearm.list_formations(problem, *((x, np.radians(phi)) for x, phi in places))
-        return {
-            "route": [" ".join(map(str, stretch.contacts)) for stretch in route],
-            "places": [stretch.stop.tolist() for stretch in route],
-        }
-    leg = draw_leg(SEED + 1, number, folder)
-    if leg is None:
-        return {"refused": "no route"}
-    return {
-        "route": [" ".join(phase["contacts"]) for phase in leg[0].table["phases"]],
-        "places": [list(stop) for stop in leg[1]],
-    }
+        formations = [map(str, stretch.contacts) for stretch in route]
+        stops = [stretch.stop.tolist() for stretch in route]
+    else:
+        leg = draw_leg(SEED + 1, number, folder)
+        if leg is None:
+            return {"refused": "no route"}
+        formations = [phase["contacts"] for phase in leg[0].table["phases"]]
+        stops = [list(stop) for stop in leg[1]]
+    return {"route": [" ".join(names) for names in formations], "places": stops}
 
 
 def count(problem: Problem) -> dict[str, int]:

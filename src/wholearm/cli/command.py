@@ -448,12 +448,17 @@ def finish(options: argparse.Namespace, result: Result | None, *paths: str | Non
     return 0 if result is None else result.exit_status
 
 
+def refuse(options: argparse.Namespace, problem: str, *names: str) -> None:
+    """Refuse the first of some options that is given, saying why; a switch that is off is not."""
+    for name in names:
+        if getattr(options, name) is not None and getattr(options, name) is not False:
+            raise InputError("", f"--{name.replace('_', '-')}", problem)
+
+
 def require_with(options: argparse.Namespace, needed: str, *names: str) -> None:
     """Check that an option is given, or else none of those that need it."""
-    for name in names if getattr(options, needed) in (None, False) else ():
-        if getattr(options, name) not in (None, False):
-            flags = (f"--{each.replace('_', '-')}" for each in (name, needed))
-            raise InputError("", next(flags), f"needs {next(flags)}")
+    if getattr(options, needed) in (None, False):
+        refuse(options, f"needs --{needed.replace('_', '-')}", *names)
 
 
 def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -533,9 +538,8 @@ def _solve(options: argparse.Namespace) -> int:
     problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
-    for key in ("cache", "jobs"):
-        if getattr(options, key) is not None and not problem.goals:
-            raise InputError("", f"--{key}", "is for problems with [goal]")
+    if not problem.goals:
+        refuse(options, "is for problems with [goal]", "cache", "jobs")
     route_text, table = "", None
     try:
         if problem.goals:
@@ -574,9 +578,8 @@ def _verify(options: argparse.Namespace) -> int:
     values = list_given(options, *keys)
     require_with(options, "free", "restitution", "policy")
     require_with(options, "policy", "sensor")
-    for key, value in {"--reduced": options.reduced, "--rest-speed": options.rest_speed}.items():
-        if value and options.free:
-            raise InputError("", key, "does not go with --free")
+    if options.free:
+        refuse(options, "does not go with --free", "reduced", "rest_speed", "uniqueness_margin")
     policy = None
     torques: wholearm.Trajectory | wholearm.TorqueProfile
     report: wholearm.Report | wholearm.FreeReport
@@ -615,8 +618,7 @@ def _plot(options: argparse.Namespace) -> int:
     require_output(options.output)
     if not _is_table(options.trajectory):
         trajectory = wholearm.load_trajectory(options.trajectory)
-        if options.problem is not None:
-            raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
+        refuse(options, "is for torques (.csv); trajectories bring their own", "problem")
     else:
         torques = wholearm.read_torque_csv(options.trajectory)
         if options.problem is None:
@@ -780,19 +782,19 @@ def _map(options: argparse.Namespace) -> int:
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
     if phi and not 0 < phi[1] - phi[0] <= 360:
         raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
-    if poses:
-        radians = [(x, math.radians(angle)) for x, angle in poses]
-        formations = wholearm.list_formations(read_problem(options), *radians)
-        print(wholearm.format_route(formations), end="")
-        if options.output is None:
-            return 0
     output = options.output or f"map_{Path(options.problem).stem}.png"
-    require_output(output)
+    drawn = options.output is not None or not poses
+    if drawn:
+        require_output(output)
     problem, plan = read_problem(options), None
     if options.plan is not None:
         problem, plan, _ = load_plan(options, options.plan)
-    _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
-    print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
+    if poses:
+        radians = [(x, math.radians(angle)) for x, angle in poses]
+        print(wholearm.format_route(wholearm.list_formations(problem, *radians)), end="")
+    if drawn:
+        _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
+        print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
 
 
@@ -1100,8 +1102,7 @@ def _new(options: argparse.Namespace) -> int:
     require_writable(output)
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
-    size = {key: getattr(options, key) for key in ("polygon", "size", "mass")}
-    size = {key: value for key, value in size.items() if value is not None}
+    size = list_given(options, "polygon", "size", "mass")
     if text := options.vertices:
         for key in [key for key in size if key != "mass"]:
             raise InputError("", f"--{key}", f"{size[key]} given; --vertices has the corners")

@@ -23,7 +23,7 @@ from ..analysis.robustness import draw_cube
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InfeasibleError, InputError
-from ..common.fields import choice
+from ..common.fields import Range, choice
 from ..common.parallel import count_cores, share
 from ..common.sharing import exclusive
 from ..planning.options import Objective, PlanOptions
@@ -247,7 +247,9 @@ def design_hand(
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     choice("time", "effort", "-margin").read(minimise, "--minimise")
-    given = np.array(weights or np.ones(len(listed)), dtype=float)
+    for key, number in (("starts", starts), ("budget", budget)):
+        Range(1, 10**5).read(number, key)
+    given = np.array(weights if len(weights) else np.ones(len(listed)), dtype=float)
     if len(given) != len(listed) or not (given > 0).all():
         text = f"{weights} given; {len(listed)} positive numbers are needed, one for each problem"
         raise InputError("", "--weights", text)

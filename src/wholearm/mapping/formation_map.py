@@ -311,7 +311,7 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     # One Newton step: between points of the map the contacts do not quite close.
     at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
-    run = length * chord / np.sqrt(chord**2 @ weights)[:, None]
+    run = chord / np.sqrt(chord**2 @ weights)[:, None]
     at = evaluate_each(scene, labels, z, run)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
     # With the share of length as path parameter.

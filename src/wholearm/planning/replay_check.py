@@ -17,7 +17,7 @@ from ..common.errors import InfeasibleError, JammingError, ReplayError, Simulati
 from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.dwell_record import HeldMotion, assemble
-from ..results.report import LeastForce, RecordedDeviation, ReplayedPhase, ReplayFigures, Report
+from ..results.report import RecordedDeviation, ReplayedPhase, ReplayFigures, Report
 from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, sample_rows
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
@@ -115,10 +115,9 @@ def replay_plan(
     assert isinstance(check.report, Report)
     phases = list[ReplayedPhase]()
     for phase in check.report.phases:
-        far = [each and RecordedDeviation(*each) for each in (phase.end_deviation, phase.deviation)]
-        one, left = phase.least_force, (phase.arrival, phase.end_speed)
-        force = one and LeastForce(one.least, one.contact, phase.number, one.time)
-        phases.append(ReplayedPhase(*left, far[0], far[1], force))
+        deviations = phase.end_deviation, phase.deviation
+        end, most = (each and RecordedDeviation(*each) for each in deviations)
+        phases.append(ReplayedPhase(phase.arrival, phase.end_speed, end, most, phase.least_force))
     least, sizes = check.report.least_force, (check.residual.size, check.report.steps, simulations)
     assert least is not None
     return planning, ReplayFigures(least, tuple(phases), *sizes)
@@ -309,7 +308,7 @@ def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
                 "planned_arrival": float(trajectory.phase_starts[index + 1]),
                 "arrival": phase.arrival if phase else None,
                 "planned_least_c_n": trajectory.least_forces[index][0],
-                "least_c_n": least.least if least else None,
+                "least_c_n": least.value if least else None,
                 "contact": least.contact if least else None,
             }
         )

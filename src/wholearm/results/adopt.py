@@ -11,7 +11,7 @@ from ..common.document import Difference, describe_differences, find_differences
 from ..common.errors import InputError
 from ..common.files import require_ending, write_text
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases, build_problem, require_phases
+from ..problem.read import adopt_phases, require_phases
 from ..problem.table import save_problem
 from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory
@@ -117,9 +117,6 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
     own = meta.get("problem")
     if not isinstance(own, Mapping) or own == problem.table:
         return ""
-    with suppress(InputError):
-        # Files of earlier versions have the tables as they were written by hand.
-        own = build_problem(own).table or own
     # Phases take the place of goals in plans.
     free = (*_FREE, ".phases") if "goal" in problem.table else _FREE
     found = list(find_differences(own, problem.table, free))

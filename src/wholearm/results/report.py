@@ -203,10 +203,11 @@ class PhaseReport(NamedTuple):
     wedged: float | None = None  # [s]: how long friction could have held it; None if not at rest
 
     @property
-    def least_force(self) -> ContactMargin | None:
-        """The contact with the least normal force; None if nothing moved."""
-        margins = [margin for margin in self.contacts if not math.isnan(margin.least)]
-        return min(margins, key=lambda margin: margin.least, default=None)
+    def least_force(self) -> LeastForce | None:
+        """The least normal force of all contacts; None if nothing moved."""
+        seen = [one for one in self.contacts if not math.isnan(one.least)]
+        forces = (LeastForce(one.least, one.contact, self.number, one.time) for one in seen)
+        return min(forces, key=lambda force: force.value, default=None)
 
 
 class ModeChange(NamedTuple):
@@ -299,8 +300,7 @@ class Report(Result):
     @property
     def least_force(self) -> LeastForce | None:
         """The least normal force of all phases; None if nothing moved."""
-        least = [(one, phase.number) for phase in self.phases if (one := phase.least_force)]
-        forces = (LeastForce(one.least, one.contact, phase, one.time) for one, phase in least)
+        forces = filter(None, (phase.least_force for phase in self.phases))
         return min(forces, key=lambda force: force.value, default=None)
 
     @property
