@@ -858,8 +858,8 @@ def find_moving(
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in modes.list_units(formation) if slow[list(unit.rows)].all()]
-    patterns = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
-    tried = (modes.respond(mode, signs, rows, v) for signs, mode in patterns)
+    every = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
+    tried = (modes.respond(mode, rows, v) for mode in every)
 
     def misfit(response: modes.Response) -> float:
         off = response.acceleration @ [1.0, *tau] - acceleration
