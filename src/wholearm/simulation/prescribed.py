@@ -420,16 +420,16 @@ class Replay(Run):
         except StuckError:
             self.fail_to_step(float(self.s.outputs.ratio[0]))
 
-    def locate(self, h: float, t: float) -> list[int]:
+    def locate(self, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
         rows, records, least = list[int](), list[Record](), math.inf
         if (self.values < -self.slack).any() and not self._is_at_end(t):
-            rows = self.find_first(h)
+            rows = self.find_first()
         if self.minima:
             records, least = self._look_inside(float(self.s.inputs.h[0]))
         if least < math.inf:
             self.step_to(least)
-            rows = self.find_first(least)
+            rows = self.find_first()
         end = self.t + float(self.s.inputs.h[0])
         self.records += [record for record in records if record.t < end]
         return rows
@@ -802,14 +802,13 @@ class Replay(Run):
 
     def coast(self, stop: float) -> None:
         """Step to `stop`, whatever happens on the way, without a record of the forces there."""
-        while self.wanted[self.next_wanted] < stop:
-            place = self.wanted[self.next_wanted]
+        while self.wanted[0] < stop:
+            place = self.wanted.popleft()
             self.step_to(place - self.t)
             self.keep(place)
             row = self.records[-1]
             none = np.full(len(row.kept), np.nan)
             self.records[-1] = row._replace(c_n=none, c_t=none)
-            self.next_wanted += 1
         self.step_to(stop - self.t)
         self.keep(stop)
         self.records.pop()
@@ -841,7 +840,7 @@ class Replay(Run):
                 return False
             self.start = self.values
             self.step_to(stretch)
-            rows = self._find_turning(self.find_first(stretch, self.turning))
+            rows = self._find_turning(self.find_first(self.turning))
             if not rows:
                 self.look()
                 return False
