@@ -553,7 +553,7 @@ def test_start_with_two_freedoms() -> None:
         change_of_state = rest.wait(tau[:, None], -1.0)
         if not isinstance(change_of_state, modes.StartDeparture):
             continue
-        directions = Directions(*np.split(change_of_state.signs, [-2]))
+        directions = Directions(*np.split(change_of_state.mode.signs, [-2]))
         if not all(map(np.all, directions)):
             continue
         seen += 1

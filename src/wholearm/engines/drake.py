@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 import logging
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from pydrake import geometry, trajectories
+from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody import plant as multibody
 from pydrake.multibody import tree
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import TrajectorySource
 
 from ..common.arrays import Array
 from ..problem.definition import Problem
@@ -35,7 +35,7 @@ def play(
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.ERROR)
-    diagram, plant, numbers = _build(problem.scene, steps, setting)
+    diagram, plant, numbers = _build(problem.scene, steps.h, setting)
     simulator = Simulator(diagram)
     log.setLevel(level)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -44,20 +44,20 @@ def play(
     plant.SetPositions(context, engine.press_in(problem, stretch, stiffness))
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
-    results = plant.get_contact_results_output_port()
-    done = 0
+    results, motors = plant.get_contact_results_output_port(), plant.get_actuation_input_port()
 
     def advance(start: int, end: int) -> Array:
-        nonlocal done
         total, looks = np.zeros(len(pairs)), range(end, start, -_EVERY)[::-1]
-        for step in looks:
+        for begin, stop in pairwise([start, *looks]):
+            torques = steps.tau[begin:stop]
             if drive is not None:
                 z, v = plant.GetPositions(context), plant.GetVelocities(context)
-                tau = drive.step(done * steps.h, z[3:], v[3:])
-                plant.get_actuation_input_port().FixValue(context, tau)
-                done = step
-            # Half a step late: the step at that time is done then, whatever its rounding.
-            simulator.AdvanceTo((step - 0.5) * steps.h)
+                tau = drive.step(begin * steps.h, z[3:], v[3:])
+                torques = np.tile(tau, (stop - begin, 1))
+            for step, tau in enumerate(torques, begin):
+                motors.FixValue(context, tau)
+                # Half a step late: the step at that time is done then, whatever its rounding.
+                simulator.AdvanceTo((step + 0.5) * steps.h)
             contact_results = results.Eval(context)
             for k in range(contact_results.num_point_pair_contacts()):
                 info = contact_results.point_pair_contact_info(k)
@@ -72,15 +72,10 @@ def play(
     return engine.record(stretch, steps, pairs, advance, read)
 
 
-def _build(
-    scene: Scene, steps: engine.Steps, setting: engine.Setting
-) -> tuple[Any, Any, dict[Any, int]]:
-    """Diagram, plant, and the numbers of pairs by the identities of their shapes.
-
-    Torques that are no feedback are part of it.
-    """
+def _build(scene: Scene, h: float, setting: engine.Setting) -> tuple[Any, Any, dict[Any, int]]:
+    """Diagram, plant with steps of h [s], and numbers of pairs by identities of their shapes."""
     builder = DiagramBuilder()
-    plant, graph = multibody.AddMultibodyPlantSceneGraph(builder, steps.h)
+    plant, graph = multibody.AddMultibodyPlantSceneGraph(builder, h)
     # The default approximation, lagged, is wrong by millimetres here; TAMSI converges.
     plant.set_discrete_contact_approximation(multibody.DiscreteContactApproximation.kTamsi)
     plant.set_contact_model(multibody.ContactModel.kPoint)
@@ -88,13 +83,6 @@ def _build(
     pairs = _add_shapes(plant, graph, scene, setting)
     plant.Finalize()
     plant.set_stiction_tolerance(1e-5 * scene.scales.speed)
-    if steps.drive is None:
-        # Held from half a step before each step on, so that rounding of times does not matter.
-        breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
-        rows = np.vstack([steps.tau, steps.tau[-1:]]).T
-        torques = trajectories.PiecewisePolynomial.ZeroOrderHold(breaks, rows)
-        source = builder.AddSystem(TrajectorySource(torques))
-        builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
     return builder.Build(), plant, pairs
 
 

@@ -101,7 +101,7 @@ class CurveLaw:
     ) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
-        self.starts = tables["starts"].tolist() or [0.0]
+        self.starts = tables["starts"].tolist()
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())

@@ -30,8 +30,6 @@ KINDS: Mapping[str, Mapping[str, tuple[int | str, ...]]] = {
     },
 }  # fmt: skip
 """Arrays of laws along a curve and over time, and their shapes; n is the number of places."""
-LATER = ("ways", "forces", "keeps", "starts", "approach")
-"""Arrays that earlier versions did not write; empty ones stand for them."""
 
 
 class Policy(Result):
@@ -274,13 +272,10 @@ def _read_tables(
     tables, count = dict[str, Any](), len(np.atleast_1d(arrays.get(f"theta_{number}", 0.0)))
     sizes: dict[int | str, int] = {"n": count, "n - 1": count - 1}
     for name, shape in shapes.items():
-        key, none = f"{name}_{number}", np.zeros([0 if isinstance(n, str) else n for n in shape])
-        array = tables[name] = arrays.get(key, none if name in LATER else None)
-        if array is None:
+        key, needed = f"{name}_{number}", [sizes.get(n, n) for n in shape]
+        if key not in arrays:
             raise InputError("", key, "array is missing")
-        needed = [sizes.get(n, n) for n in shape]
-        if name in LATER and isinstance(shape[0], str) and array.shape[:1] == (0,):
-            needed[0] = 0
+        array = tables[name] = arrays[key]
         fits = array.dtype.kind == "f" and array.ndim == len(shape)
         if not fits or any(w not in (n, "any") for w, n in zip(needed, array.shape, strict=True)):
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape "

@@ -30,7 +30,7 @@ import numpy as np
 
 from ..common.arrays import Array, Flags, Independent, Numbers, find_root
 from ..results.trajectory import interpolate_quintic
-from .events import EventKind, describe_change
+from .events import EventKind, Outcome, OutcomeKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
 from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Modes, System
@@ -360,8 +360,8 @@ class FreeRun(Run):
         self.unit = system.scales.length
         self.resting = self.unique = False
 
-    def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
-        """Simulate until the torques end or `halt`, called at events.
+    def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> Outcome:
+        """Simulate until the torques end or `halt`, called at events; how that ends.
 
         `touching` are gaps to close at the start [m].
         """
@@ -383,8 +383,7 @@ class FreeRun(Run):
             if moved and self.stands:
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
-                self.note(EventKind.GIVEN_UP, "decisions do not end")
-                return
+                return self._give_up("decisions do not end")
             failure = "no motion obeys the laws of contact" if rests is None else ""
             self.resting = self.resting if rests is None else rests
             if rests:
@@ -397,10 +396,13 @@ class FreeRun(Run):
                     # Forces grow without bound where the motion jams.
                     failure = "steps become too short"
             if failure and not self._jolt():
-                self.note(EventKind.GIVEN_UP, failure)
-                if not self.records:
-                    self.record(still=True)
-                return
+                return self._give_up(failure)
+        return Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {self.t:.5g} s")
+
+    def _give_up(self, failure: str) -> Outcome:
+        if not self.records:
+            self.record(still=True)
+        return Outcome(OutcomeKind.GIVEN_UP, self.note(EventKind.GIVEN_UP, failure))
 
     # Instants: impacts and modes.
 

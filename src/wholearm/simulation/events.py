@@ -194,9 +194,10 @@ class Simulation(Drawn):
         arrays = samples._asdict() | {"t": t, "phase": phases, "contacts": self.contacts}
         return Trajectory(**arrays, torque=self.torque, motions=motions, meta=meta)
 
-    def find(self, kind: EventKind) -> tuple[Event, ...]:
-        """Events of one kind, in the order of time."""
-        return tuple(event for event in self.events if event.kind is kind)
+    def find(self, *kinds: EventKind, phase: int | None = None) -> tuple[Event, ...]:
+        """Events of some kinds in the order of time, all or those of a phase by its index."""
+        events = (event for event in self.events if event.kind in kinds)
+        return tuple(event for event in events if phase is None or event.phase == phase)
 
     def show(self, contacts: Sequence[str]) -> Simulation:
         """The same with other columns of forces, NaN where a contact never pressed."""

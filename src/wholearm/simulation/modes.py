@@ -75,15 +75,13 @@ def list_units(formation: Formation) -> tuple[Unit, ...]:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mode:
-    """A formation with what rolls or sticks and is held.
-
-    `holders` are the rows, among contacts and then joints, of what each force after c_n holds.
-    """
+    """A formation with what rolls or sticks and is held, and which way the rest goes."""
 
     formation: Formation
-    holders: tuple[tuple[int, ...], ...]
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what is held or rolls
+    holders: tuple[tuple[int, ...], ...]  # rows of `signs` that each force after c_n holds
 
     @cached_property
     def n_constraints(self) -> int:
@@ -119,13 +117,13 @@ def find_mode(formation: Formation, signs: Array) -> Mode:
     held: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
     if formation.n_constraints < 4:
         held += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
-    return Mode(formation, tuple(sorted(held)))
+    return Mode(formation, signs, tuple(sorted(held)))
 
 
 def list_modes(
     formation: Formation, signs: Array, units: Sequence[Unit], held: bool = True
-) -> Iterator[tuple[Array, Mode]]:
-    """Each combination of signs of some units that leaves a freedom to move in.
+) -> Iterator[Mode]:
+    """The mode of each combination of signs of some units that leaves a freedom to move in.
 
     They replace those among `signs`, (n_c + 2,); zero is one of units with friction that may be
     `held`.
@@ -137,7 +135,7 @@ def list_modes(
             tried[list(unit.rows)] = sign
         mode = find_mode(formation, tried)
         if mode.n_constraints <= 4:
-            yield tried, mode
+            yield mode
 
 
 def _list_pairs(formation: Formation) -> tuple[int, ...]:
@@ -159,7 +157,6 @@ class Response(NamedTuple):
     """How a mode answers to torques; quantities are rows @ (1, tau_1, tau_2)."""
 
     mode: Mode
-    signs: Array  # (n_c + 2,): of sliding and turning, zero for what is held or rolls
     c: Array  # (n_c + K, 3) [N, N m]: normal forces, then those of what is held
     acceleration: Array  # (5, 3)
     rates: Array  # (n_c + 2, 3): accelerations of the contacts' sliding and of the joints
@@ -183,21 +180,18 @@ class Response(NamedTuple):
     @property
     def c_t(self) -> Array:
         """Friction of the contacts, (n_c, 3) [N]; NaN where a flush edge sticks: it is shared."""
-        count = self.mode.formation.n_contacts
-        c_t = -(self.mode.formation.sliding_friction * self.signs[:count])[:, None] * self.c[:count]
+        formation, count = self.mode.formation, self.mode.formation.n_contacts
+        c_t = -(formation.sliding_friction * self.mode.signs[:count])[:, None] * self.c[:count]
         for force, rows in zip(self.c[count:], self.mode.holders, strict=True):
             if rows[0] < count:
                 c_t[list(rows)] = force if len(rows) == 1 else np.nan
         return c_t
 
 
-def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response | None:
-    """Solve the equations of motion at velocity v, (5,); None for dependent constraints.
-
-    `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
-    """
+def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
+    """Solve the equations of motion at velocity v, (5,); None for dependent constraints."""
     scene, count, held = mode.formation.scene, mode.formation.n_contacts, mode.held
-    slip = (mode.formation.sliding_friction * signs[:count])[:, None] * rows.A_t[:count]
+    slip = (mode.formation.sliding_friction * mode.signs[:count])[:, None] * rows.A_t[:count]
     P, G = (np.vstack([part, rows.A_t[held]]) for part in (rows.A, rows.A - slip))
     inverse_mass = 1 / scene.mass_diagonal
     if mode.n_constraints > mode.formation.n_constraints:
@@ -207,7 +201,7 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
             return None
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
-    applied[3:, 0] -= scene.dry[3:] * signs[count:]
+    applied[3:, 0] -= scene.dry[3:] * mode.signs[count:]
     applied[:, 1:] = _JOINTS.T
     drop = P * inverse_mass
     K = drop @ G.T
@@ -220,7 +214,7 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = rows.A_t @ acceleration
     rates[:, 0] += rows.bend_t
-    return Response(mode, signs, c, acceleration, rates, ratio)
+    return Response(mode, c, acceleration, rates, ratio)
 
 
 def find_fixed(mode: Mode, rows: ContactRows) -> Flags:
@@ -237,7 +231,7 @@ class StartDeparture(NamedTuple):
 
     x: float
     heading: Array  # (5,): where to, of length one in the metric M5
-    signs: Array  # (n_c + 2,): of sliding and turning, zero for what friction holds
+    mode: Mode
 
 
 class Collapse(NamedTuple):
@@ -286,7 +280,7 @@ class StartMode(NamedTuple):
     def depart(self, x: float, tau: Array) -> StartDeparture:
         """Start at `x` of a piece, where the torques are `tau`."""
         heading = self.response.acceleration @ [1.0, *tau] / self.drive(tau)
-        return StartDeparture(x, heading, self.response.signs)
+        return StartDeparture(x, heading, self.response.mode)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,8 +296,8 @@ class Rest:
     def sliding(self) -> tuple[StartMode, ...]:
         """Start modes without sticking: two with one freedom, all sign patterns with more."""
         if self.heading is not None:
-            ways = ((self._find_signs(h), h) for h in (self.heading, -self.heading))
-            modes = (self._build(find_mode(self.formation, signs), signs, h) for signs, h in ways)
+            ways = self.heading, -self.heading
+            modes = (self._build(find_mode(self.formation, self._find_signs(h)), h) for h in ways)
             return tuple(mode for mode in modes if mode is not None)
         return self._list_patterns(held=False)
 
@@ -334,9 +328,8 @@ class Rest:
         """Start modes with more freedoms: only those with sticking, or only the others."""
         formation, none = self.formation, np.zeros(self.formation.n_contacts + 2)
         every = list_modes(formation, none, list_units(formation), held)
-        patterns = [one for one in every if (len(one[1].holders) > formation.n_rolling) == held]
-        patterns.sort(key=lambda pattern: len(pattern[1].holders))
-        modes = (self._build(mode, signs) for signs, mode in patterns)
+        chosen = [mode for mode in every if (len(mode.holders) > formation.n_rolling) == held]
+        modes = map(self._build, sorted(chosen, key=lambda mode: len(mode.holders)))
         return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
@@ -359,18 +352,18 @@ class Rest:
             rates = np.where(still, np.where(moves, ahead, 0.0), rates)
         return np.asarray(np.sign(rates))
 
-    def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
-        """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
+    def _build(self, mode: Mode, heading: Array | None = None) -> StartMode | None:
+        """The start mode of a mode; None if its forces are not determined."""
         scene, count = self.formation.scene, self.formation.n_contacts
         still, A_t = np.zeros(count + 2), np.vstack([self.statics.A_t, _JOINTS])
         rows = ContactRows(self.statics.A, A_t, still[:count], still, still)
-        response = respond(mode, signs, rows, np.zeros(5))
+        response = respond(mode, rows, np.zeros(5))
         if response is None:
             return None
         declared = [mode.declares(k) for k in range(len(mode.holders))]
         kept = np.array([True] * count + declared + declared)
         scales, length = scene.scales, scene.scales.length
-        slips = signs[:, None] * response.rates
+        slips = mode.signs[:, None] * response.rates
         # What opens, or closes by no more than counts as grazing.
         graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
         openings = self.statics.opening[0] @ response.acceleration + graze
@@ -617,7 +610,7 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
     for mode in _list_sliding(place.formation, z):
         rows, closing = rest, -normal @ mode.response.acceleration
         if mode.heading is None:
-            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
+            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.mode.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
         enough = closing - [DRIVE * scales.acceleration, 0.0, 0.0]

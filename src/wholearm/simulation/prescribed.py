@@ -177,12 +177,14 @@ class Replay(Run):
 
     @signs.setter
     def signs(self, signs: Array) -> None:
+        self.mode = replace(self.mode, signs=signs)
         self.s.inputs.Xi[:], self.s.inputs.sigma[3:] = signs[:-2], signs[-2:]
 
-    def take(self, mode: modes.Mode, signs: Array, heading: Array) -> None:
-        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
+    def take(self, mode: modes.Mode, heading: Array) -> None:
+        """Go on in a mode, with the direction of the motion, (5,)."""
         self.load(mode.find_modes())
-        self.mode, self.signs, self.heading = mode, signs, heading
+        self.mode, self.heading = mode, heading
+        self.signs = mode.signs
         rows, count = self.s.rows, len(self.ends.texts)
         self.turning = slice(rows.slide.start, rows.slide.stop + 2)
         self.limit = slice(self.turning.stop, self.turning.stop + count)
@@ -418,16 +420,16 @@ class Replay(Run):
         except StuckError:
             self.fail_to_step(float(self.s.outputs.ratio[0]))
 
-    def locate(self, h: float, t: float) -> list[int]:
+    def locate(self, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
         rows, records, least = list[int](), list[Record](), math.inf
         if (self.values < -self.slack).any() and not self._is_at_end(t):
-            rows = self.find_first(h)
+            rows = self.find_first()
         if self.minima:
             records, least = self._look_inside(float(self.s.inputs.h[0]))
         if least < math.inf:
             self.step_to(least)
-            rows = self.find_first(least)
+            rows = self.find_first()
         end = self.t + float(self.s.inputs.h[0])
         self.records += [record for record in records if record.t < end]
         return rows
@@ -549,7 +551,7 @@ class Replay(Run):
         if not speed or not self.rate:
             return 0.0
         rows = modes.evaluate_rows(self.formation, self.z, v)
-        response = modes.respond(self.mode, self.signs, rows, v)
+        response = modes.respond(self.mode, rows, v)
         if response is None:
             return 0.0
         later = self.breaks[self.piece + 1 : bisect_right(self.breaks, self.t + longest)]
@@ -613,7 +615,7 @@ class Replay(Run):
         self.ends = _build_ends(formation, until, side)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         none = np.zeros(formation.n_contacts + 2)
-        self.take(modes.find_mode(formation, none + 1), none, np.zeros(5))
+        self.take(replace(modes.find_mode(formation, none + 1), signs=none), np.zeros(5))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
@@ -654,13 +656,12 @@ class Replay(Run):
         if not self.gets_on():
             raise SimulationError(f"starting and stopping do not end {self.when()}")
         self.note(EventKind.START, "the object starts to move")
-        formation, signs = self.formation, departure.signs
-        mode = modes.find_mode(formation, signs)
+        formation, mode = self.formation, departure.mode
         if formation.n_constraints < 4:
             fixed = modes.find_fixed(mode, modes.evaluate_rows(formation, self.z, self.v))
             gripped = (row for u in modes.list_units(formation) if u.grips for row in u.rows)
             self.stuck = {row for row in gripped if fixed[row]}
-        self.take(mode, signs, departure.heading)
+        self.take(mode, departure.heading)
         self.observe()
         return self.move()
 
@@ -730,15 +731,15 @@ class Replay(Run):
         if not self.gets_on():
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
-        chosen, mode = self._choose(signs, still)
-        rows = modes.evaluate_rows(formation, self.z, self.v)
+        mode = self._choose(signs, still)
+        chosen, rows = mode.signs, modes.evaluate_rows(formation, self.z, self.v)
         fixed = modes.find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
         first = np.array([unit.rows[0] for unit in still])
         wrong = first[(chosen[first] == 0) | (chosen[first] * (rows.A_t[first] @ self.v) < 0)]
         stays = [*formation.rolling_rows, *wrong]
         self.project_velocity(np.vstack([rows.A, rows.A_t[stays]]))
-        self.take(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
+        self.take(mode, self.v / np.sqrt(self.system.mass @ self.v**2))
         for unit in still:
             row = unit.rows[0]
             before = 0.0 if row in self.stuck else float(signs[row])
@@ -801,14 +802,13 @@ class Replay(Run):
 
     def coast(self, stop: float) -> None:
         """Step to `stop`, whatever happens on the way, without a record of the forces there."""
-        while self.wanted[self.next_wanted] < stop:
-            place = self.wanted[self.next_wanted]
+        while self.wanted[0] < stop:
+            place = self.wanted.popleft()
             self.step_to(place - self.t)
             self.keep(place)
             row = self.records[-1]
             none = np.full(len(row.kept), np.nan)
             self.records[-1] = row._replace(c_n=none, c_t=none)
-            self.next_wanted += 1
         self.step_to(stop - self.t)
         self.keep(stop)
         self.records.pop()
@@ -840,7 +840,7 @@ class Replay(Run):
                 return False
             self.start = self.values
             self.step_to(stretch)
-            rows = self._find_turning(self.find_first(stretch, self.turning))
+            rows = self._find_turning(self.find_first(self.turning))
             if not rows:
                 self.look()
                 return False
@@ -870,14 +870,14 @@ class Replay(Run):
         kind, text = describe_change(name, before, after, "slides" if contact else "turns")
         self.note(kind, text, name)
 
-    def _choose(self, signs: Array, still: Sequence[modes.Unit]) -> tuple[Array, modes.Mode]:
-        """The most consistent signs of what stands still; `JammingError` without any."""
+    def _choose(self, signs: Array, still: Sequence[modes.Unit]) -> modes.Mode:
+        """The most consistent mode by signs of what stands still; `JammingError` without any."""
         formation, scales, ahead = self.formation, self.system.scales, self.settling
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
         present, count = modes.evaluate_rows(formation, self.z, self.v), formation.n_contacts
         speeds, ratios = np.repeat([scales.speed, scales.rate], [count, 2]), [1.0]
 
-        def measure(signs: Array, mode: modes.Mode) -> tuple[float, float] | None:
+        def measure(mode: modes.Mode) -> tuple[float, float] | None:
             """Least margin of acceleration along the signs or of friction, and least c_n, relative.
 
             None if the combination jams or leaves its forces undetermined.
@@ -887,27 +887,26 @@ class Replay(Run):
                 v = self.v + delay * acceleration
                 z = self.z + delay * (self.v + v) / 2
                 rows = modes.evaluate_rows(formation, z, v) if delay else present
-                response = modes.respond(mode, signs, rows, v)
+                response = modes.respond(mode, rows, v)
                 if response is None or not response.ratio > 0:
                     ratios.extend([] if response is None else [response.ratio])
                     return None
                 acceleration = response.acceleration @ load
                 rates = rates + response.rates @ load / 2
                 held = response.force_limits @ load / mode.force_limit_units
-            gained = signs * rates / (speeds / scales.time)
+            gained = mode.signs * rates / (speeds / scales.time)
             cones = held[count:].reshape(2, -1).min(axis=0)
             margins = [np.inf]
             for unit in still:
                 row = unit.rows[0]
-                if signs[row] == 0:
+                if mode.signs[row] == 0:
                     margins.append(cones[mode.holders.index(unit.rows)])
                 elif abs(gained[row]) > CLEAR:
                     margins.append(gained[row])
             return float(min(margins)), float(held[:count].min())
 
-        patterns = modes.list_modes(formation, signs, still)
-        measured = [(measure(*pattern), pattern) for pattern in patterns]
-        choices = [(*margins, pattern) for margins, pattern in measured if margins is not None]
+        measured = [(measure(mode), mode) for mode in modes.list_modes(formation, signs, still)]
+        choices = [(*margins, mode) for margins, mode in measured if margins is not None]
         pressing = [choice for choice in choices if min(choice[:2]) > -CLEAR]
         # Where none presses a contact is about to be lost, and its forces say which.
         pulling = [choice for choice in choices if choice[1] <= -CLEAR]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -44,7 +45,7 @@ class Run(ABC):
     piece: int  # of the torques, which the present time belongs to
     steps_at: list[bool]  # whether the torques step at the start of each piece
     impact: float  # [J]: energy lost to impacts so far
-    wanted: list[float]  # [s]: instants at which steps have to end; infinity is last
+    wanted: deque[float]  # [s]: later instants at which steps have to end; infinity is last
     # values, start: event values after the step just made and before it, in units of the scene: an
     # event is where one falls below zero
     values: Array
@@ -74,7 +75,7 @@ class Run(ABC):
         self.records: list[Record] = []
         self.events: list[Event] = []
         within = (t for t in wanted if self.breaks[0] <= t <= self.breaks[-1])
-        self.wanted, self.next_wanted = [*map(float, within), math.inf], 0
+        self.wanted = deque([*map(float, within), math.inf])
         self.residual = 0.0
         self.sample()
         self.decisions, self.decided_at = 0, -math.inf
@@ -108,9 +109,9 @@ class Run(ABC):
     def shift(self) -> Array:
         """How far below zero each event value has to fall, by its value before the step."""
 
-    def locate(self, h: float, t: float) -> list[int]:
-        """Shorten the step just made, of length `h` to `t` [s], to its first events; their rows."""
-        return self.find_first(h)
+    def locate(self, t: float) -> list[int]:
+        """Shorten the step just made, to time `t` [s], to its first events; their rows."""
+        return self.find_first()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
         """The first pair that closes within the step just made, of length `h`, and when [s].
@@ -232,12 +233,12 @@ class Run(ABC):
         self.s.inputs.y[:], self.s.inputs.t[:] = self.y, t
         self.record()
 
-    def find_first(self, h: float, among: slice = slice(None)) -> list[int]:
-        """Shorten the step just made, of length h [s], to its first event; rows of `values`.
+    def find_first(self, among: slice = slice(None)) -> list[int]:
+        """Shorten the step just made to its first event; rows of `values`.
 
         `among` are the rows to look at. That of a pair that closes is its number after these.
         """
-        shift = self.shift
+        shift, h = self.shift, float(self.s.inputs.h[0])
         before, places = np.maximum(self.start + shift, 0.0), np.arange(len(shift))[among]
         seen, done = list[int](), list[int]()
         last = -1
@@ -271,12 +272,10 @@ class Run(ABC):
     def move(self) -> Any:
         """Integrate with the present modes until the contact rule ends the motion; how it does."""
         while True:
-            while self.wanted[self.next_wanted] <= self.t:
-                self.next_wanted += 1
-            target = min(self.stop, self.wanted[self.next_wanted])
-            h, whole = self.try_step(target)
-            t = target if whole else self.t + h
-            if rows := self.locate(h, t):
+            while self.wanted[0] <= self.t:
+                self.wanted.popleft()
+            t = self.try_step(min(self.stop, self.wanted[0]))
+            if rows := self.locate(t):
                 self.keep(self.t + float(self.s.inputs.h[0]))
                 ending = self.handle(rows)
             else:
@@ -289,13 +288,8 @@ class Run(ABC):
         """Start the next step from the state whose event values are known."""
         self.start = self.values
 
-    def try_step(self, target: float) -> tuple[float, bool]:
-        """Make a step within the tolerance, to `target` [s] at most.
-
-        Returns
-        -------
-        h, whole  its length [s] and whether it ends at `target`
-        """
+    def try_step(self, target: float) -> float:
+        """Make a step within the tolerance, to `target` [s] at most; when it ends [s]."""
         remaining, time = target - self.t, self.system.scales.time
         self.begin_step()
         least = SHORTEST_STEP * max(time, abs(self.t))
@@ -312,7 +306,7 @@ class Run(ABC):
                 grown = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                 self.h = grown if h >= self.h else max(self.h, grown)
                 self.steps += 1
-                return h, whole
+                return target if whole else self.t + h
             self.rejected += 1
             if h < least:
                 raise StuckError
@@ -320,10 +314,9 @@ class Run(ABC):
 
     def wait(self, stop: float) -> None:
         """Let time pass at rest."""
-        while self.wanted[self.next_wanted] <= stop:
-            self.t = max(self.t, self.wanted[self.next_wanted])
+        while self.wanted[0] <= stop:
+            self.t = max(self.t, self.wanted.popleft())
             self.record(still=True)
-            self.next_wanted += 1
         self.t = stop
         self.record(still=True)
 

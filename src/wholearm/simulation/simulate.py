@@ -24,7 +24,7 @@ from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from .events import Energies, EventKind, Outcome, OutcomeKind, Simulation, list_stretches
+from .events import Energies, Outcome, Simulation, list_stretches
 from .prescribed import Replay
 from .run import Feedback, Law, Run
 from .system import SLOW, Modes, build_system
@@ -173,12 +173,7 @@ def _simulate(
     from .complementarity import FreeRun
 
     run = FreeRun(system, profile, z, v, hint=hint, **options)
-    run.play(touching, halt)
-    outcome = Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {run.t:.5g} s")
-    for event in run.events:
-        if event.kind is EventKind.GIVEN_UP:
-            outcome = Outcome(OutcomeKind.GIVEN_UP, event.text)
-    return _conclude(run, problem, outcome, clock=np.asarray(starts))
+    return _conclude(run, problem, run.play(touching, halt), clock=np.asarray(starts))
 
 
 def _conclude(

@@ -192,8 +192,8 @@ def find_policy(
 
 def warn(title: str, simulation: Simulation) -> list[str]:
     """What was not decided by the laws of contact alone."""
-    told = EventKind.AMBIGUOUS, EventKind.INCONSISTENT
-    return [f"{title}: {event.text}" for event in simulation.events if event.kind in told]
+    events = simulation.find(EventKind.AMBIGUOUS, EventKind.INCONSISTENT)
+    return [f"{title}: {event.text}" for event in events]
 
 
 def _compare(

@@ -226,8 +226,8 @@ def judge(
         steps=simulation.steps,
         changes=tuple(
             results.ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
-            for e in simulation.events
-            if e.kind in _CHANGES and e.contact
+            for e in simulation.find(*_CHANGES)
+            if e.contact
         ),
         reduced=list_reduced_states(simulation) if reduced else (),
         replay=simulation,
@@ -239,9 +239,8 @@ def _report_phase(
 ) -> results.PhaseReport:
     problem, phase = simulation.problem, simulation.problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
-    ends = EventKind.ARRIVAL, EventKind.RELEASE
-    arrivals = [e for e in simulation.events if e.phase == index and e.kind in ends]
-    impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
+    arrivals = simulation.find(EventKind.ARRIVAL, EventKind.RELEASE, phase=index)
+    impacts = simulation.find(EventKind.IMPACT, phase=index)
     formation, until = phase.formation, str(phase.until)
     if arrivals and phase.until.is_release:
         what = "release" if arrivals[0].kind is EventKind.RELEASE else "change"
@@ -258,7 +257,7 @@ def _report_phase(
     end = worst = held = least = None
     if uniqueness:
         # Since it starts to move, if it does.
-        starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
+        starts = [e.time for e in simulation.find(EventKind.START, phase=index)]
         held = find_wedged(problem, phase, simulation, REST_SPEED, *starts[:1])
         least = find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
@@ -334,12 +333,8 @@ def list_normal_forces(simulation: Simulation, phase: Phase) -> dict[str, Array]
     A contact that is let go without a jump of the torques passes epsilon on its way to zero: what
     it has below epsilon on that way is NaN.
     """
-    gone = {
-        name
-        for event in simulation.find(EventKind.RELEASE)
-        if event.phase == phase.index
-        for name in event.contact.split(", ")
-    }
+    releases = simulation.find(EventKind.RELEASE, phase=phase.index)
+    gone = {name for event in releases for name in event.contact.split(", ")}
     forces = {}
     for name in phase.formation.names:
         values = simulation.c_n[simulation.phase == phase.index, simulation.contacts.index(name)]
@@ -355,7 +350,7 @@ def _find_least(
 ) -> Iterator[tuple[str, float, float]]:
     """Least value of each contact and its time; that of an event of its loss where it is less."""
     t = simulation.t[simulation.phase == index]
-    events = {e.contact: e for e in simulation.find(kind) if e.phase == index}
+    events = {e.contact: e for e in simulation.find(kind, phase=index)}
     for name, values in series.items():
         has_values = not np.isnan(values).all()
         row = int(np.nanargmin(values)) if has_values else 0
@@ -670,8 +665,8 @@ def find_help(
     rolling = [{contact.name for contact in phase.formation.rolling} for phase in problem.phases]
     events = [
         (e.phase, e.contact, _KINDS[e.kind], e.time)
-        for e in simulation.events
-        if e.kind in _KINDS and (e.kind is not EventKind.SLIP or e.contact in rolling[e.phase])
+        for e in simulation.find(*_KINDS)
+        if e.kind is not EventKind.SLIP or e.contact in rolling[e.phase]
     ]
     ended = {event[:2] for event in events}
     allowed = measure_stray(problem)
@@ -858,8 +853,8 @@ def find_moving(
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in modes.list_units(formation) if slow[list(unit.rows)].all()]
-    patterns = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
-    tried = (modes.respond(mode, signs, rows, v) for signs, mode in patterns)
+    every = modes.list_modes(formation, signs, still, formation.n_constraints < 4)
+    tried = (modes.respond(mode, rows, v) for mode in every)
 
     def misfit(response: modes.Response) -> float:
         off = response.acceleration @ [1.0, *tau] - acceleration
