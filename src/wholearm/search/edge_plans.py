@@ -69,6 +69,11 @@ PartPlan = list[tuple[Phase, TimeMotion | None]]
 """Planned phases of a part of a route, with pinned landings, and the motions of those over time."""
 
 
+def roughen(options: PlanOptions) -> PlanOptions:
+    """Options of coarse plans, which do not depend on the objective and the accuracy."""
+    return replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, certify=False)
+
+
 def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
     """Steps as phases."""
     return [
@@ -99,7 +104,7 @@ def plan_coarsely(
     """
     from ..planning.time_domain.time_plan import try_phases
 
-    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH)
+    rough = roughen(options)
     phases, z, spent = make_phases(problem, steps), edge.start.z, 0.0
     try:
         single = replace(problem, goals=(), phases=tuple(phases))

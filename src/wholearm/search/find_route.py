@@ -35,6 +35,7 @@ from ..problem.read import name_goal
 from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
 from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
+from .edge_plans import roughen
 from .edges import Blocked
 from .places import is_at, make_place, require_reach
 from .roadmap import LONGEST, Roadmap
@@ -129,9 +130,9 @@ def get_roadmap(
 ) -> tuple[str, Roadmap]:
     """The roadmap of a problem's scene, from memory, from a folder, or a new one.
 
-    And everything that it depends on, as JSON.
+    And everything that it depends on, as JSON. It keeps coarse plans, which depend on options.
     """
-    numbers = problem.epsilon, options.uniqueness_margin
+    numbers = problem.epsilon, repr(roughen(options))
     key = json.dumps(describe_scene(problem.scene) | {"": numbers}, sort_keys=True)
     roadmap = _roadmaps.pop(key, None)
     if roadmap is None and cache is not None:
