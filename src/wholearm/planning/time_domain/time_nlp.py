@@ -673,19 +673,20 @@ def find_bounds(
             else:
                 high[indices] = np.minimum(high[indices], -floor)
         if stage.formation.scene.has_slow_motors:
-            _free_equal(stage, rows, low, low_g)
+            _free_equal(stage, rows, scheme, low, low_g)
         low_g[rows.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
         low_g[rows.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
     return (low, high), (low_g, high_g)
 
 
-def _free_equal(stage: Stage, rows: StageRows, low_x: Array, low_g: Array) -> None:
+def _free_equal(stage: Stage, rows: StageRows, scheme: Scheme, low_x: Array, low_g: Array) -> None:
     """Remove bounds, in place, of forces that are given by equations."""
     for contact, slips in stage.fading:
         given = _find_sides(stage, rows.limits, contact, CONE if slips else PRESS)
         for side, on_rows, indices in rows.parts:
             if given[side] and on_rows and not slips:
-                low_g[indices[-1, 1:2]] = -np.inf
+                if not scheme.ends:  # the row of the end; otherwise a point's bound, below
+                    low_g[indices[-1, 1]] = -np.inf
             elif given[side]:
                 (low_g if on_rows else low_x)[indices[-1, -1]] = -np.inf
     for contact in stage.growing:
