@@ -256,8 +256,9 @@ def test_what_departs_with_some_settings_only_has_not_converged() -> None:
     lost = held._replace(time=0.01, reason="v0-palm opens at t = 0.01 s")
     for finer, verdict in ((held, "NOT CONVERGED"), (lost, "DEPARTS")):
         levels = tuple(engine_replay.Level(COARSE, (own,)) for own in (lost, finer))
-        report = engine_replay.EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
-        assert report.exit_status == 1 and f": {verdict}: " in report.to_text().splitlines()[0]
+        report = engine_replay.EngineReport(problem, "MuJoCo", 3e-6, (stretch,), levels)
+        text = report.to_text().splitlines()[0]
+        assert report.exit_status == 1 and f": {verdict}: within 0.0000000 mm" in text
 
 
 def test_an_engine_that_is_missing_or_unknown(

@@ -625,13 +625,15 @@ def test_a_gallery_shows_every_problem(
     problem, page, text = tmp_path / "slide.toml", tmp_path / "b/c.md", write_template("s", 4, 0.05)
     (tmp_path / "weak.toml").write_text(re.sub("(?m)^mass = .*", "mass = 90", text), "utf-8")
     problem.write_text(text, encoding="utf-8")
-    for other, status in (("none", 2), ("weak", 1)):
-        paths = [str(problem), str(tmp_path / f"{other}.toml")]
-        assert main(["gallery", *paths, "-o", str(page)]) == status
-        assert f"wholearm: {paths[1]}: " in capsys.readouterr().err and not page.exists()
-    assert main(["gallery", str(problem), str(problem), "-o", str(page)]) == 0
+    paths = [str(tmp_path / f"{name}.toml") for name in ("slide", "none", "weak")]
+    assert main(["gallery", *paths, "-o", str(page)]) == 2 and not page.exists()
+    paths[1] = paths[0]
+    assert main(["gallery", *paths, "-o", str(page)]) == 1
+    assert f"wholearm: {paths[2]}: phase 1 is infeasible: " in capsys.readouterr().err
     text = page.read_text(encoding="utf-8")
-    assert re.search(r"^\| slide_1 \|.*\| ok \|$", text, re.M)
+    assert len(re.findall(rf"^\| {problem} \|.*\| ok \|$", text, re.M)) == 2
+    assert re.search(r"weak.toml \| - \|.*\| no plan: phase 1 is infeasible: .*\|$", text, re.M)
+    assert f"## {problem}: s\n" in text
     for name in re.findall(r"\]\((.*?)\)", text):
         assert (page.parent / name).stat().st_size < 1_000_000
     assert len(list(page.with_suffix("").iterdir())) == 4
@@ -868,7 +870,7 @@ def test_what_is_planned_over_time_is_not_certified(within: Plan) -> None:
         ({"replay": {}}, (), "does not describe a plan"),
         ({"certificate": {"parts": [3]}}, (), "does not describe a plan"),
         ({"timings": {"plan": "long"}}, (), "does not describe a plan"),
-        ({}, ("value",), "does not describe a plan"),
+        ({}, ("value",), "does not describe a plan: 'value' is missing"),
         ({}, ("problem",), "does not hold its problem's tables"),
     ],
 )

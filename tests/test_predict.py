@@ -238,6 +238,8 @@ def test_tuned_torques_hold_every_contact_end_at_rest_and_are_written(tmp_path: 
     assert np.array_equal(torque.coefficients, found.torque.coefficients)
     assert read_notes(str(path))["simulations"] == str(found.simulations)
     assert f"{found.simulations} simulations" in found.to_text()
+    small = dataclasses.replace(found.phases[0], quasistatic=(1.23456e-4, -2e-5))
+    assert "0.00012346 -0.00002000" in dataclasses.replace(found, phases=(small,)).to_text()
     assert found.to_dict()["phases"][0]["trials"][0]["outcome"] == "rests"
 
 

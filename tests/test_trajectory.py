@@ -302,7 +302,7 @@ def test_the_same_file_in_other_words(tmp_path: Path, text: str) -> None:
         (GOOD.replace("2,-2", "2"), "tau2", "'' on line 3"),
         (GOOD.replace("2,-2", "2,").replace("\n0,", "\n\n\n0,"), "tau2", "'' on line 5"),
         (GOOD.replace("2,1,3", "0.4,1,3"), "t", "goes back from 0.5 to 0.4"),
-        (GOOD.replace("2,1,3", "0.5,1,3"), "t", "three times"),
+        (GOOD.replace("2,1,3", "0.5,1,3"), "t", "0.5 s is given three times, again on line 5"),
         (GOOD.replace("\n0,1", "\n0.1,1"), "t", "first time is 0.1"),
         (GOOD.replace("\n0,1", "\n-0.1,1"), "t", "first time is -0.1"),
         ("t,tau1,tau2\n0,1,1\n0,2,2\n", "t", "every time is 0"),

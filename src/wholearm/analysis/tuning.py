@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.arrays import Array, find_root
-from ..common.document import Document, Result, Table
+from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, name_source
 from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
@@ -226,13 +226,17 @@ class Tuning(Result):
     @property
     def document(self) -> Document:
         """The verdict with its reason, and a table of the phases."""
+        acted = [phase for phase in self.phases if phase.acting]
+        torques = np.abs(np.nan_to_num([phase.quasistatic for phase in acted])).max(initial=0.0)
+        forces = np.abs(np.nan_to_num([phase.least for phase in acted])).max(initial=0.0)
+        torque, force = fixed(min(2.0, float(torques)), 5), fixed(min(0.5, float(forces)), 4)
         columns = {
             "title": "phase:d", "until": "until", "acting": "finger:d",
-            "quasistatic": "from [N m]:.4f", "raised": "drive:+d", "braked": "brake:+d",
+            "quasistatic": f"from [N m]:{torque}", "raised": "drive:+d", "braked": "brake:+d",
             "supported": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
-            "least": "least c_n [N]:.4f", "weakest": "of", "simulations": "simulations:d",
+            "least": f"least c_n [N]:{force}", "weakest": "of", "simulations": "simulations:d",
         }  # fmt: skip
-        tuned = Table.of((phase for phase in self.phases if phase.acting), columns)
+        tuned = Table.of(acted, columns)
         last = "" if self.duration is None else f", {self.duration:.5f} s"
         return self.judge(self.name, self.reason, [tuned, f"{self.simulations} simulations{last}"])
 

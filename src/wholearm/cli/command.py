@@ -35,7 +35,7 @@ from ..common.errors import (
     require_number,
 )
 from ..common.fields import Range, choice, keys_of, read_options
-from ..common.files import number_same, require_ending, require_writable, together, write_text
+from ..common.files import READ, number_same, require_ending, require_writable, together, write_text
 from ..common.signals import listen, on_end
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
@@ -59,7 +59,8 @@ TOPICS = {
 }  # fmt: skip
 """Folder of the page of each topic."""
 
-SIMULATORS = ("told", "free")  # what `--simulate` takes; the first one if it is left out
+INPUTS = {"problem", "problems", "plan", "trajectory", "torques", "files", "policy"}
+"""Names of files that are read. But the option `--torques` is a file to write."""
 PROBLEM = "problem  problem file (TOML)\n"
 PLAN = "plan  trajectory file (.npz)\n"
 JSON = "--json  print the result as JSON\n"
@@ -118,7 +119,8 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
---simulate [free]  overlay the simulated forces; free: without given contacts among told|free
+--simulate [told|free]  overlay the simulated forces; told: of the given contacts, as without a
+    word; free: without given contacts among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
 [[predict]]  see up to which speed slow motions keep every contact
@@ -253,7 +255,8 @@ problems PROBLEM ...   problem files (TOML), for one hand
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html for any browser (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
---simulate [free]  draw the simulated motion behind; free: without given contacts among told|free
+--simulate [told|free]  draw the simulated motion behind; told: with the given contacts, as without
+    a word; free: without given contacts among told|free
 [[report]]  put a problem and its plans into one page to open anywhere
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
@@ -273,23 +276,10 @@ The function of its name, after an underscore, carries a command out."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    options = argparse.Namespace()
     try:
-        words = prepare(sys.argv[1:] if arguments is None else arguments)
-        options = build_parser(words).parse_args(words)
-        if not sys.stderr.isatty():
-            _LINES.begin(os.getpid())
-        try:
-            status: int = options.run(options)
-        finally:
-            _LINES.begin(0)
+        status = _run(prepare(sys.argv[1:] if arguments is None else arguments))
         sys.stdout.flush()
         return status
-    except WholearmError as error:
-        if isinstance(error, InputError) and not error.source and hasattr(options, error.key):
-            error = InputError("", f"--{error.key.replace('_', '-')}", error.problem)
-        _complain(str(error))
-        return error.exit_status
     except OSError as error:
         # Files are written elsewhere, with errors of their own; this is the output.
         if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO):
@@ -299,6 +289,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno != errno.EPIPE:
             _complain(f"standard output: cannot be written: {error.strerror}")
         return 1
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run a command; its error is a line on stderr, and with `--json` an object on stdout, too."""
+    options = argparse.Namespace()
+    try:
+        options = build_parser(words).parse_args(words)
+        READ.clear()
+        for given in (getattr(options, name) for name in options.inputs):
+            paths = given if isinstance(given, list) else [given]
+            READ.update(map(os.path.realpath, filter(None, paths)))
+        if not sys.stderr.isatty():
+            _LINES.begin(os.getpid())
+        try:
+            status: int = options.run(options)
+        finally:
+            _LINES.begin(0)
+        return status
+    except WholearmError as error:
+        if isinstance(error, InputError) and not error.source and hasattr(options, error.key):
+            error = InputError("", f"--{error.key.replace('_', '-')}", error.problem)
+        _complain(str(error))
+        if getattr(options, "json", "--json" in words):
+            print(json.dumps(error.to_dict() | getattr(options, "notes", {}), indent=2))
+        return error.exit_status
 
 
 def _complain(text: str) -> None:
@@ -332,8 +347,9 @@ def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
     """Add the parser of a command or study: what it is for, options and files (`read_options`)."""
     title = f"{text[0].upper()}{text[1:]}."
     parser: Parser = parsers.add_parser(name, help=text, description=title)
-    for option in read_options(table):
-        parser.add_argument(*option.flags, **option.arguments)
+    actions = [parser.add_argument(*each.flags, **each.arguments) for each in read_options(table)]
+    named = [action for action in actions if action.dest in INPUTS and not action.type]
+    parser.set_defaults(inputs=[a.dest for a in named if "--torques" not in a.option_strings])
     return parser
 
 
@@ -370,14 +386,15 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
 def prepare(given: Sequence[str]) -> list[str]:
     """Arguments as argparse takes them: `--simulate` with its simulator, `--list` without a sign.
 
-    It would take a file for the simulator that is left out, and of several pairs one alone after
-    an equals sign.
+    It would take a file for the simulator that is left out, which is `told`, and of several pairs
+    one alone after an equals sign.
     """
     left, texts = [*given], list[str]()
     while left:
         text = left.pop(0)
         if text == "--simulate":
-            text += f"={left.pop(0) if left and left[0] in SIMULATORS else SIMULATORS[0]}"
+            word = left and re.fullmatch(r"\w+", left[0]) and not os.path.exists(left[0])
+            text += f"={left.pop(0) if word else 'told'}"
         texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
     return texts
 
@@ -480,7 +497,8 @@ def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
     from ..common.parallel import Processes, connect
 
     if options.scheduler is not None:
-        return partial(connect, options.scheduler)
+        client = connect(options.scheduler)  # before any file is begun
+        return lambda: client
     return partial(Processes, options.jobs)
 
 
@@ -660,11 +678,12 @@ def _predict(options: argparse.Namespace) -> int:
     problem = read_problem(options)
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress)
     save_figure(options.output, "draw_prediction", prediction)
-    status = finish(options, prediction)
+    if not options.json:
+        finish(options, prediction)  # of use where there are no torques to write, too
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
-    finish(options, None, options.output, options.torques)
-    return status
+    finish(options, prediction if options.json else None, options.output, options.torques)
+    return prediction.exit_status
 
 
 def _tune(options: argparse.Namespace) -> int:
@@ -702,11 +721,13 @@ def _robustness(options: argparse.Namespace) -> int:
     for text in options.vary:
         name, _, value = text.partition("=")
         try:
+            if name in widths:
+                raise ValueError(name)
             widths[name] = float(value)
         except ValueError:
-            fault = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
+            fault = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1, and each name once"
             raise InputError("", "--vary", fault) from None
-    ranges = problem.ranges | spread_widths(widths, "range of {}")
+    ranges = problem.ranges | spread_widths(widths, "--vary {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
     trials = wholearm.Uncertainty(ranges, options.sample_rate or None, options.tolerance, *goal)
     study = wholearm.assess_robustness(
@@ -720,7 +741,10 @@ def _robustness(options: argparse.Namespace) -> int:
         progress=show_progress,
     )
     save_figure(options.figure, "draw_robustness", study)
-    return finish(options, study, output, options.figure)
+    status = finish(options, study, options.figure)
+    if not options.json:
+        print(f"results: {output}")  # of earlier runs, too, or of these alone
+    return status
 
 
 def _route(options: argparse.Namespace) -> int:
@@ -996,8 +1020,11 @@ def _gallery(options: argparse.Namespace) -> int:
     from ..viewer.report_page import write_gallery
 
     require_ending(options.output, ".md")
-    write_gallery(options.files, options.output, show_progress)
-    return finish(options, None, options.output)
+    failures = write_gallery(options.files, options.output, show_progress)
+    finish(options, None, options.output)
+    for text in failures:
+        _complain(text)
+    return 1 if failures else 0
 
 
 def _animate(options: argparse.Namespace) -> int:
@@ -1082,14 +1109,13 @@ def _completion(options: argparse.Namespace) -> int:
 
 def _complete_files(parser: Parser, files: object, folders: object) -> None:
     """Let all arguments that name files or folders be completed so."""
-    named = {"problem", "plan", "trajectory", "torques", "files", "output"}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for subparser in action.choices.values():
                 _complete_files(subparser, files, folders)
         elif action.metavar == "DIR":
             action.complete = folders  # type: ignore[attr-defined]
-        elif action.metavar in ("FILE", "PLAN") or (action.dest in named and not action.type):
+        elif action.metavar in ("FILE", "PLAN") or (action.dest in INPUTS and not action.type):
             action.complete = files  # type: ignore[attr-defined]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from numbers import Real
@@ -85,6 +86,16 @@ class WholearmError(Exception):
     phases: Sequence[int] = ()  # numbers of those that have no plan together, where that is known
     phase: int | None = None  # number of the phase that was simulated
 
+    def to_dict(self) -> dict[str, Any]:
+        """Text and exit status, with whatever else the error knows, as plain values for JSON."""
+        from .document import plain  # of errors alone it is too much to import
+
+        names = "source", "key", "phases", "phase", "shortfalls", "changes"
+        known = {name: getattr(self, name, None) for name in names}
+        known = {name: value for name, value in known.items() if value}
+        values: dict[str, Any] = plain({"error": str(self), "status": self.exit_status} | known)
+        return values
+
 
 class InputError(WholearmError):
     """Malformed input: names the file, the key, what was given and what is allowed.
@@ -119,7 +130,9 @@ def name_source(source: str = "", prefix: str = "") -> Iterator[None]:
     except InputError as error:
         if error.source or not (source or prefix):
             raise
-        raise InputError(source, prefix + error.key, error.problem) from None
+        # Booleans of files are no Python.
+        text = re.sub("^(True|False)(?= )", lambda word: word[0].lower(), error.problem)
+        raise InputError(source, prefix + error.key, text if source else error.problem) from None
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 from .errors import InputError, name_file
 from .signals import held, on_end
 
+READ: set[str] = set()  # resolved paths of the files that the command being run reads
 LARGEST = 2**28  # largest array that is read [byte]: a million rows of everything take less
 
 
@@ -23,6 +24,8 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     """Raise an `InputError`, before long work, if no file can be written at `path`."""
     target = os.fspath(path)
     folder = os.path.dirname(os.path.realpath(target))
+    if os.path.realpath(target) in READ:
+        raise InputError(target, "", "cannot be written: this command reads it")
     if os.path.isdir(target):
         raise InputError(target, "", "cannot be written: is a folder")
     if not os.path.isdir(folder):

@@ -102,7 +102,7 @@ def require_allowed(problem: Problem, name: str, value: Any, label: str) -> None
     except InputError as error:
         keys = name, *name_keys().get(name, ())
         if any(key.partition("[")[0] == error.key.partition("[")[0] for key in keys):
-            raise InputError(error.source, f"{label} {name}", error.problem) from None
+            raise InputError(problem.source, f"{label} {name}", error.problem) from None
 
 
 def _find_every(problem: Problem) -> dict[str, Parameter]:

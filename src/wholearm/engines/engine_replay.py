@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array, Flags, Independent, Numbers, find_runs, sort_unique
-from ..common.document import Document, Result, Table
+from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, WholearmError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
@@ -464,15 +464,17 @@ class EngineReport(Result):
             f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
             "torques contain the dry friction of the joints, with its planned signs"
         )
-        shares = [f"{k / PARTS:.0%} [mm]:.4f" for k in range(1, PARTS + 1)]
-        names = [f"{stretch.name} [mm]:.4f" for stretch in self.stretches]
-        heads = ["phase:d", "duration [s]:.6f", "largest [mm]:.4f", "[deg]:.4f", *shares]
-        other = ["phase:d", "contact", "planned mean c_n [N]:.4f", "found [N]:.4f", "off [%]:+.2f"]
+        off, press = fixed(min(millimetres, 0.09)), fixed(min(scales.force, 9.0), 5)
+        shares = [f"{k / PARTS:.0%} [mm]:{off}" for k in range(1, PARTS + 1)]
+        names = [f"{stretch.name} [mm]:{off}" for stretch in self.stretches]
+        heads = ["phase:d", "duration [s]:.6f", f"largest [mm]:{off}", "[deg]:.4f", *shares]
+        other = ["phase:d", "contact", f"planned mean c_n [N]:{press}", f"found [N]:{press}"]
+        other.append("off [%]:+.2f")
         finer = ["step [s]:.3g", "softness:g", *names]
         return Document(
             f"{self.problem.name} in {self.title}",
             "ok" if self.ok else "DEPARTS" if self.converged else "NOT CONVERGED",
-            f"within {worst:.4f} mm and {turned:.4f} degrees of the plan "
+            f"within {worst:{off}} mm and {turned:.4f} degrees of the plan "
             f"(allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
             [*lines, Table(heads, errors), Table(other, forces), Table(finer, levels)],
         )
@@ -692,10 +694,11 @@ class PolicyReport(Result):
     @property
     def document(self) -> Document:
         """Durations and final errors."""
+        off = fixed(min(1e3 * self.allowed * self.problem.scene.scales.length, 0.09))
         columns = {
             "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
-            "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
-            "gap": "largest gap [mm]:.4f", "contact": "",
+            "duration": "policy [s]:.6f", "position": f"end off [mm]:{off}", "angle": "[deg]:.4f",
+            "gap": f"largest gap [mm]:{off}", "contact": "",
         }  # fmt: skip
         failures = [self.find_failure(end) or "" for end in self.arrivals]
         title = f"{self.problem.name} in {self.title}, by the policy"

@@ -473,11 +473,11 @@ def _describe_miss(scene: Scene, leg: Leg, start: Array, stop: Array) -> str:
     """A border beside both ends of a straight leg, how far it is, and what is near."""
     assert leg.track.flush is not None
     finger, edge = leg.track.flush
-    gaps = leg.at(leg.start) - start, leg.at(leg.stop) - stop
-    dx, dphi = (max(pair, key=abs) for pair in np.transpose(gaps).tolist())
-    part, away = "the palm", f"{np.degrees(dphi):+.3g} deg in phi"
+    gaps = np.abs([leg.at(leg.start) - start, leg.at(leg.stop) - stop])
+    dx, dphi = gaps.max(axis=0).tolist()
+    part, away = "the palm", f"{np.degrees(dphi):.3g} deg in phi"
     if finger is not None:
-        part, away = f"finger {finger + 1}", f"{1e3 * dx:+.3g} mm in x and {away}"
+        part, away = f"finger {finger + 1}", f"{1e3 * dx:.3g} mm in x and {away}"
     x, phi = tolerance(scene)
     return (
         f"the nearest border, e{edge} flush on {part}, is up to {away} away; "

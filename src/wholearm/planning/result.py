@@ -208,7 +208,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         with name_source(source, "meta."):
             return _read(trajectory, problem)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        what = f"does not describe a plan: {type(error).__name__} {error}"
+        missing = " is missing" if isinstance(error, KeyError) else ""
+        what = f"does not describe a plan: {error}{missing}"
         raise InputError(source, "meta", what) from None
 
 

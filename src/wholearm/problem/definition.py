@@ -303,9 +303,9 @@ class Problem:
         from .read import build_problem, name_keys
         from .table import change_table
 
-        with name_source(self.source):
-            table = change_table(self.table, {**(changes or {}), **named}, name_keys())
-        return build_problem(table, self.source)
+        # Values that are not in the file: its name would mislead.
+        table = change_table(self.table, {**(changes or {}), **named}, name_keys())
+        return replace(build_problem(table), source=self.source)
 
     @property
     def ranges(self) -> dict[str, float]:

@@ -169,8 +169,10 @@ def read_torque_csv(path: str) -> TorqueProfile:
     if (steps < 0).any():
         at = int(np.argmax(steps < 0)) + 1
         raise InputError(str(path), "t", f"time goes back from {t[at - 1]:g} to {t[at]:g} s")
-    if ((steps[1:] == 0) & (steps[:-1] == 0)).any():
-        raise InputError(str(path), "t", "a time is given three times; twice makes a step")
+    if (again := (steps[1:] == 0) & (steps[:-1] == 0)).any():
+        at = int(again.argmax()) + 2
+        text = f"{t[at]:g} s is given three times, again on line {numbered[at + 1][0]}"
+        raise InputError(str(path), "t", f"{text}; twice makes a step")
     if t[-1] == 0.0:
         raise InputError(str(path), "t", "every time is 0; the torques must last")
     return TorqueProfile.join_rows(values)

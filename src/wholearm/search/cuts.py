@@ -198,7 +198,7 @@ def find_hand(planner: RoutePlanner, seconds: float) -> tuple[str, tuple[Change,
             try:
                 changed = planner.problem.with_(change.values)
                 require_reach(changed.scene, search.goal, float(search.start.z[2]))
-            except (InputError, InfeasibleError):
+            except InputError:
                 continue
             closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
             if closed.obstacle.any():

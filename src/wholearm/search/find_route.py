@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.document import Document, Result, Table
-from ..common.errors import Change, InfeasibleError, InputError, SolverError
+from ..common.errors import Change, InfeasibleError, InputError, SolverError, name_source
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, interruptible, limited, yielding
@@ -86,7 +86,7 @@ def find_route(
 
     Raises
     ------
-    InputError       if the problem has no goals, or an option is out of its range
+    InputError       if the problem has no goals, one is out of reach, or an option out of its range
     InfeasibleError  if nothing leads to a goal; names what blocks the way
     SolverError      if the time is over before there is a plan; names what is missing
     """
@@ -109,7 +109,8 @@ def find_route(
             if is_at(place, goal):
                 reason = f"{goal} holds already where the motion starts"
                 raise InputError(problem.source, name_goal(problem.goals, index), reason)
-            require_reach(problem.scene, goal, float(start[2]))
+            with name_source(problem.source, f"{name_goal(problem.goals, index)}."):
+                require_reach(problem.scene, goal, float(start[2]))
             search, last = RouteSearch(roadmap, place, goal), before[-1].plan if before else None
             wanted = 1 + (alternatives if index + 1 == len(problem.goals) else 0)
             given = problem, last, search, plan_options, report, wanted, jobs, spent

@@ -10,7 +10,7 @@ from itertools import combinations, product
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError
+from ..common.errors import InputError
 from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
@@ -131,7 +131,7 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
 
 
 def require_reach(scene: Scene, goal: Goal, near: float) -> None:
-    """Raise an InfeasibleError if the fingers do not close on an object at a goal.
+    """Raise an InputError if the fingers do not close on an object at a goal.
 
     It says where they would. The angle of the object before is `near` [rad].
     """
@@ -142,4 +142,4 @@ def require_reach(scene: Scene, goal: Goal, near: float) -> None:
     closed = close_fingers(scene, x, np.full(3, phi))
     if (closed.obstacle > 0).any(axis=1).all():
         why, where = describe_obstacle(closed), name_reach(scene, phi)
-        raise InfeasibleError(f"nothing leads to {goal}: {why} there; {where}")
+        raise InputError("", "x", f"{goal.x:g} given; {why} there; {where}")

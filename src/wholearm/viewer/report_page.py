@@ -203,27 +203,31 @@ def _describe_border(border: Border, times: Array) -> str:
 
 def write_gallery(
     paths: Sequence[str], path: str, progress: Callable[[str], None] = lambda text: None
-) -> None:
+) -> list[str]:
     """Plan the least time of problems and write them to a page of Markdown.
 
-    Figures and movies, which last 2 s, go to a folder beside the page that has its name.
+    Figures and movies, which last 2 s, go to a folder beside the page that has its name. Problems
+    without a plan have a row with the reason; returned are these, with the files.
 
-    WholearmError if a problem cannot be read or planned; files appear only if all are.
+    InputError if a problem cannot be read, or a file cannot be written; none appears then.
     """
     problems, folder = [*map(load, paths)], os.path.splitext(path)[0]
     make_folder(os.path.dirname(path) or os.curdir)
     require_writable(path)
-    plans, rows, pictures = list[Plan](), list[tuple[object, ...]](), list[str]()
+    plans, rows, pictures = list[Plan | str](), list[tuple[object, ...]](), list[str]()
     for source, problem in zip(paths, problems, strict=True):
         try:
             plans.append(solve(problem, progress=lambda text, s=source: progress(f"{s}: {text}")))
         except WholearmError as error:
-            error.args = (f"{source}: {str(error).removeprefix(f'{source}: ')}",)
-            raise
+            plans.append(str(error).removeprefix(f"{source}: "))
+    stems = [Path(source).stem for source in paths]
+    titles = stems if len({*stems}) == len(stems) else paths
     with together():
         make_folder(folder)
-        names = number_same([Path(source).stem for source in paths])
-        for name, plan in zip(names, plans, strict=True):
+        for title, name, plan in zip(titles, number_same(stems), plans, strict=True):
+            if isinstance(plan, str):
+                rows.append((title, None, None, None, "", f"no plan: {plan}"))
+                continue
             progress(f"{name}: figure and movie")
             stem = os.path.join(folder, name)
             plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
@@ -233,14 +237,16 @@ def write_gallery(
             gap = "" if report.finger_gap is None else report.finger_gap.least
             least = report.least_force
             verdict = "ok" if report.ok else "FAILED"
-            rows.append((name, len(plan.phases), plan.value, least and least.value, gap, verdict))
+            rows.append((title, len(plan.phases), plan.value, least and least.value, gap, verdict))
             place = quote(f"{os.path.basename(folder)}/{name}")
             links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
-            pictures.append(f"## {plan.problem.name}\n\n{links}")
+            heading = ": ".join(dict.fromkeys((title, plan.problem.name)))
+            pictures.append(f"## {heading}\n\n{links}")
         text = (
-            "Least-time plans, each slowed down to 2 s: contact forces in their friction cones, "
+            "Least-time plans, each shown in about 2 s: contact forces in their friction cones, "
             "and torques as arcs at the joints."
         )
         heads = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f"]
         table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows)
         write_text(path, Document("Gallery", parts=[text, table, *pictures]).to_markdown())
+    return [f"{s}: {text}" for s, text in zip(paths, plans, strict=True) if isinstance(text, str)]
