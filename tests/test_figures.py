@@ -243,17 +243,11 @@ def test_text_is_inside_and_apart_in_other_widths(width: float, trajectory: Traj
     figure = plots.force_margins(trajectory, width=width, motion=True)
     assert figure.get_figwidth() == width
     check_layout(figure)
-    pose, angles, speeds = figure.axes[-3:]
-    assert data_of(line_of(pose, "x [mm]"))[1][-1] == pytest.approx(1e3 * trajectory.q[-1, 0])
-    angle = np.degrees(trajectory.theta[0, 1])
-    assert data_of(line_of(angles, "finger 2"))[1][0] == pytest.approx(angle)
+    place, angles, speeds = figure.axes[-3:]
+    assert data_of(line_of(place, "x"))[1][-1] == pytest.approx(1e3 * trajectory.q[-1, 0])
+    for label, angle in (("phi", trajectory.q[-1, 2]), ("finger 2", trajectory.theta[-1, 1])):
+        assert data_of(line_of(angles, label))[1][-1] == pytest.approx(np.degrees(angle))
     assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == trajectory.theta_dot[:, 0].max()
-
-
-@pytest.mark.parametrize("width", [2.0, 50.0, float("nan")])
-def test_widths_that_are_no_paper_are_refused(width: float, trajectory: Trajectory) -> None:
-    with pytest.raises(InputError, match="width"):
-        plots.force_margins(trajectory, width=width)
 
 
 def test_simulation_is_drawn_over_the_plan(trajectory: Trajectory) -> None:
@@ -305,10 +299,13 @@ def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -
     assert not list(tmp_path.iterdir())
 
 
-def test_trajectory_without_its_problem_is_refused(trajectory: Trajectory) -> None:
+def test_what_cannot_be_drawn_is_refused(trajectory: Trajectory) -> None:
     bare = replace(trajectory, meta={"epsilon": 0.05})
     with pytest.raises(InputError, match=r"meta\.problem"):
         plots.force_margins(bare)
+    for width in (2.0, 50.0, math.nan):
+        with pytest.raises(InputError, match="width"):
+            plots.force_margins(trajectory, width=width)
 
 
 def test_odd_names_are_drawn_as_they_are(trajectory: Trajectory) -> None:

@@ -218,7 +218,14 @@ def test_figures(box: Problem) -> None:
     vary = {"mass": mass, "epsilon": [0.0, 0.1], "x": [0.0, 0.001, 0.002]}
     panels = wholearm.draw_sweep(make(vary, box)).axes
     assert [axes.get_title() for axes in panels[:3]] == ["x = 0", "x = 0.001", "x = 0.002"]
-    samples = wholearm.draw_sweep(make({"mass": (0.1, 0.3), "epsilon": (0, 1)}, box, 4)).axes
+    # One column has plans: there are no contour lines, nor lines for them at the colour bar.
+    vary = {"mass": [0.1, 0.285, 0.3], "epsilon": [0, 0.05, 0.1, 0.2]}
+    column, bar = wholearm.draw_sweep(make(vary, box)).axes
+    assert column.texts[0].get_position() == pytest.approx((0.269375, 0.0875))
+    assert not bar.yaxis.get_gridlines()[0].get_visible()
+    samples = wholearm.draw_sweep(make({"mass": (0.001, 0.003), "epsilon": (0, 1)}, box, 4)).axes
+    samples[0].figure.canvas.draw()
+    assert max(len(label.get_text()) for label in samples[0].get_xticklabels()) <= 4
     assert [axes.get_xlabel() for axes in samples] == ["mass [kg]", "epsilon [N]"]
 
 

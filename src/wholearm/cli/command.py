@@ -636,6 +636,7 @@ def _plot(options: argparse.Namespace) -> int:
     require_output(options.output)
     if not _is_table(options.trajectory):
         trajectory = wholearm.load_trajectory(options.trajectory)
+        moved: wholearm.Simulation | wholearm.Trajectory = trajectory
         refuse(options, "is for torques (.csv); trajectories bring their own", "problem")
     else:
         torques = wholearm.read_torque_csv(options.trajectory)
@@ -644,11 +645,12 @@ def _plot(options: argparse.Namespace) -> int:
         problem = wholearm.load(options.problem)
         # Steps alone are too far apart for smooth curves; a figure is some 1000 points wide.
         how: Any = {"times": [k / 1000 * torques.breaks[-1] for k in range(1001)], "minima": True}
-        trajectory = wholearm.simulate(problem, torques, **how, progress=show_progress).trajectory
+        moved = wholearm.simulate(problem, torques, **how, progress=show_progress)
+        trajectory = moved.trajectory
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
         figure = wholearm.plots.force_margins(
-            trajectory, simulation=simulation, motion=options.motion, **list_given(options, "width")
+            moved, simulation=simulation, motion=options.motion, **list_given(options, "width")
         )
     wholearm.plots.save(figure, options.output)
     return finish(options, None, options.output)

@@ -138,7 +138,6 @@ class _Drawing:
         ]
         boxes = [self._write_inside(names[k], region & clear) for k, region in self.parts]
         look: Any = {"color": "#666666", "style": "italic"}
-        look["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]  # over the hatching
         texts = ["joint 2 in or above the object", "joint 1 in or above the object"]
         texts += ["finger 2 too short", "finger 1 too short"]
         for name, code in [*zip(texts, range(-4, 0), strict=True), ("fingers overlap", CROSSED)]:
@@ -159,6 +158,8 @@ class _Drawing:
                 place = np.array([self.x[column], self.phi[row]])
                 size = (half[::-1] + 3) / self.scale
                 style: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": turn} | look
+                # Over lines, arrows and hatching.
+                style["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]
                 self._write(place, text, **style)
                 return np.stack([place - size, place + size])
         return None

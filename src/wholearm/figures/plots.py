@@ -141,7 +141,7 @@ def choose_numbers(
                 place = vertices[index] + shift
                 far = [
                     np.abs(vertices[k] + other_shift - place)
-                    > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
+                    > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))) + 0.3, 1.2])
                     for k, other_shift in numbers.items()
                 ]
                 if all(apart.any() for apart in far) and place[1] > lowest:
@@ -376,15 +376,15 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> None:
 
 
 def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
-    """Draw the object's pose, and the joints' angles and speeds, over time on three axes."""
+    """Draw place, angles and joint speeds over time on three axes."""
     t = trajectory.t
+    looks: Any = ((0, "x", "#0072B2", "-"), (0, "y", "#E69F00", (0, (5, 1.5))))
+    looks += ((1, "phi", "#0072B2", "-."),)
     pose = np.column_stack([1e3 * trajectory.q[:, :2], np.degrees(trajectory.q[:, 2])])
-    looks: Any = (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))))
-    for column, (name, colour, line) in enumerate((*looks, ("phi [deg]", style.INK, "-."))):
-        panels[0].plot(t, pose[:, column], color=colour, linestyle=line, label=name)
-    panels[0].set_ylabel("pose")
-    panels[1].set_ylabel("joint angle\n[deg]")
-    panels[2].set_ylabel("joint speed\n[rad/s]")
+    for (panel, name, colour, line), values in zip(looks, pose.T, strict=True):
+        panels[panel].plot(t, values, color=colour, linestyle=line, label=name)
+    for axes, label in zip(panels, ("place [mm]", "angle [deg]", "speed [rad/s]"), strict=True):
+        axes.set_ylabel(label)
     for index, (colour, _) in enumerate(style.FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
         look["label"] = f"finger {index + 1}"
@@ -455,7 +455,7 @@ def force_margins(
     width : [in]  of the figure, 3 to 40. Below 7 legends stand at the foot.
     motion        whether to draw the object's pose, and the joints' angles and speeds, too
 
-    Axes are in the order: snapshots, margins, torques, cones, pose, angles and speeds.
+    Axes are in the order: snapshots, margins, torques, cones, place, angles, joint speeds.
 
     InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
     range.
@@ -474,13 +474,14 @@ def force_margins(
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
     if scene.fingers_collide:
         least = find_finger_gap(scene, trajectory).least
-        text = f"{1e3 * least:.3g} mm" if least < 0.9995 else f"{least:.3g} m"
+        # What is below 1 nm is a rounding error.
+        text = f"{round(1e3 * least, 6) + 0.0:.3g} mm" if least < 0.9995 else f"{least:.3g} m"
         parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
     # From the foot of the figure to its title, in inches. A slim one has its legend at the foot.
     rolls, slim, line = bool(trajectory.rolling.any()), width < 7.0, 0.17
     strip = lay_out_strip(trajectory, scene, width - 0.3, slim)
     columns = max(1, int((width - 0.3) / 1.05))
-    keys = len(trajectory.contacts) + 3 + (simulation is not None)
+    keys = len(trajectory.contacts) + 3 + 3 * motion + (simulation is not None)
     foot = 0.55 + (line * math.ceil(keys / columns) + 0.1 if slim else 0.0)
     share = 0.65 if slim else 1.0
     sizes = [1.2 * share] * 3 * motion + [1.75 * share] + [0.85] * rolls + [3.6 * share]
@@ -502,8 +503,13 @@ def force_margins(
             for place in [places[3 * motion], *places[-2:][:rolls], *places[2::-1][: 3 * motion]]
         )
         panels = [margins, torques, *others]
-        more: ArrayLike = () if simulation is None else simulation.c_n - epsilon
+        # Forces of a replay that ends at a step of the torques are those after it.
+        last = getattr(what, "c_n", trajectory.c_n)[-1] - epsilon
+        more = last if simulation is None else np.append(simulation.c_n - epsilon, last)
         draw_margins(margins, trajectory, epsilon, styles, more)
+        for k in np.flatnonzero(last < -epsilon):
+            look: Any = {"color": styles[trajectory.contacts[k]].colour, "clip_on": False}
+            margins.plot(trajectory.duration, last[k], "x", zorder=6, **look)
         draw_torques(torques, trajectory.torque, scene.torque_limit)
         if simulation is not None:
             draw_simulation(margins, torques, simulation, epsilon)
@@ -524,7 +530,9 @@ def force_margins(
                 axes.set_ylabel(f"{name} {style.unit_of(axes)}")
                 lines, labels = axes.get_legend_handles_labels()
                 legend |= zip(labels, lines, strict=True)
-            look: Any = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
+            for own in [own for axes in others[-3:-1] * motion for own in axes.lines]:
+                legend.setdefault(str(own.get_label()), own)
+            look = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
             look |= {"ncols": columns, "columnspacing": 1.0}
             figure.legend([*legend.values()], [*legend], **look)
         lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))

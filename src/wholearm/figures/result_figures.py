@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon, Rectangle
@@ -103,8 +104,8 @@ def draw_prediction(prediction: Prediction) -> Figure:
     rows = max(math.ceil(len(phases) / columns), 1)
     # Size of a panel with what is written about it, and the room that this takes [in].
     (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
-    forces = [force[0] for each in phases if each.curves for force in each.curves.force.values()]
-    prefix, factor = style.choose_prefix(2.2 * float(np.nanmax([prediction.epsilon, *forces])))
+    scales = [_measure_force(phase, prediction.epsilon) for phase in phases]
+    prefix, factor = style.choose_prefix(2.2 * max(scales, default=prediction.epsilon))
     with style.open_figure(columns * wide, rows * tall + 0.45) as figure:
         for k, phase in enumerate(phases):
             row, column = divmod(k, columns)
@@ -119,12 +120,18 @@ def draw_prediction(prediction: Prediction) -> Figure:
     return figure
 
 
+def _measure_force(phase: PhasePrediction, epsilon: float) -> float:
+    """The largest of the forces at the least speeds that motions have [N], at least epsilon."""
+    assert phase.curves is not None
+    forces = phase.curves.force.values()
+    return max([epsilon, *(float(known[0]) for f in forces if len(known := f[np.isfinite(f)]))])
+
+
 def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     """The lines of one phase, with where they break, and above them what breaks."""
     curves = phase.curves
     assert curves is not None
-    rest = max([epsilon, *(float(force[0]) for force in curves.force.values())])
-    low, high = -0.35 * rest, 2.2 * rest
+    low, high = _measure_force(phase, epsilon) * np.array([-0.35, 2.2])
     axes.axhspan(0.0, epsilon, color=style.LOW, linewidth=0, zorder=1)
     axes.axhspan(low, 0.0, color=style.LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
@@ -285,12 +292,17 @@ def draw_sweep(sweep: Sweep) -> Figure:
                 mesh = _draw_plane(axes, sweep, shown, rows, colours)
             else:
                 _draw_lines(axes, sweep, shown[k], panel, colours)
+            # So many labels, of so few digits, have room side by side.
+            axes.locator_params(axis="x", nbins=6)
+            axes.ticklabel_format(axis="x", scilimits=(-2, 4))
         for axes in grid.flat[len(panels) :]:
             axes.remove()
         if contours:
             look: Any = {"label": sweep.label, "ticks": MaxNLocator(LEVELS)}
             bar = figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), **look)
-            bar.ax.grid(axis="y", **CONTOUR)
+            drawn = [each for axes in grid.flat for each in axes.findobj(ContourSet)]
+            if any(len(line) for each in drawn for line in each.get_paths()):
+                bar.ax.grid(axis="y", **CONTOUR)
         keys = list[Line2D]()
         for reason, count in [*reasons.items()][:8]:
             look = {"color": colours[reason] if crosses else _pale(colours[reason])}
@@ -377,7 +389,8 @@ def _draw_plane(
     values, every = values.reshape(len(x), len(y)).T, _take(sweep.rows)[0]
     low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
-    mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
+    borders = _border(x), _border(y)
+    mesh = axes.pcolormesh(*borders, values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
         levels, known = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
         axes.contour(x, y, known, levels).set(**CONTOUR)
@@ -387,8 +400,13 @@ def _draw_plane(
         shades[here] = *_pale(colour), 1.0
         if here.mean() > SHARE and here.any(axis=0).mean() > 0.35:  # wide enough
             below, left = np.nonzero(here)
-            _write(axes, reason, colour, x[left].mean(), y[below].mean(), axes.transData)
-    axes.pcolormesh(_border(x), _border(y), shades)
+            # Cells at the edges are halves: their middles are not at the values.
+            across, up = (
+                (each[at] + each[at + 1]).mean() / 2
+                for each, at in zip(borders, (left, below), strict=True)
+            )
+            _write(axes, reason, colour, across, up, axes.transData)
+    axes.pcolormesh(*borders, shades)
     return mesh
 
 
