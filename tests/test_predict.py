@@ -208,8 +208,7 @@ def test_without_quasistatic_torques_the_table_is_printed(
 ) -> None:
     # Torques too weak to hold the object; the file begins with a byte order mark.
     file, table = tmp_path / "weak.toml", tmp_path / "a.csv"
-    weak = re.sub("torque_limit = .*", "torque_limit = 0.02", text_of())
-    file.write_text(weak, encoding="utf-8-sig")
+    file.write_text(re.sub("torque_limit = .*", "torque_limit = 0.02", text_of()), "utf-8-sig")
     assert main(["predict", str(file), "--torques", str(table)]) == 1
     out, err = capsys.readouterr()
     assert "keeps epsilon to" in out and "torque of finger 2 and finger 2" not in out
@@ -399,10 +398,8 @@ def test_a_rolling_contact_is_mended(kind: str, first: float, second: float) -> 
     assert abs(loss.forces[k].c_t) > mu * loss.forces[k].c_n * (1 - 1e-6)
     mend = loss.changes[0]
     assert not mend.but and isinstance(report.replay, Simulation)
-    # The torques step here already.
-    torque = step(report.replay.torque, loss.time, np.array(mend.change))
-    simulation = simulate(problem, torque)
-    after = np.flatnonzero(simulation.t == loss.time)[-1]
+    simulation = simulate(problem, step(report.replay.torque, loss.time, np.array(mend.change)))
+    after = np.flatnonzero(simulation.t == loss.time)[-1]  # torques step here already
     assert simulation.t[-1] > loss.time
     column = simulation.contacts.index(loss.contact)
     c_n, c_t = simulation.c_n[after, column], simulation.c_t[after, column]
@@ -452,8 +449,7 @@ def test_figures_are_those_of_verify(tmp_path: Path) -> None:
     problem, paths = first_phase(), write(tmp_path)
     found = compare(problem, paths)
     moved, noted, lost, still = found.contenders
-    report = verify(problem, PUSH)
-    energy = report.energy
+    energy = (report := verify(problem, PUSH)).energy
     assert moved.name == "moved.npz" and noted.simulations == 37 and moved.simulations is None
     for own in (moved, noted):
         assert own.reason == report.reason and own.ok == report.ok

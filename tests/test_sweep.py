@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +36,7 @@ def result(box: Problem, path: Path) -> Sweep:
 
 
 def test_rows_are_plans(box: Problem, result: Sweep) -> None:
-    assert [(row["torque_limit"], row["mass"]) for row in result.rows] == [
-        (torque, mass) for torque in GRID["torque_limit"] for mass in GRID["mass"]
-    ]
+    assert [(row["torque_limit"], row["mass"]) for row in result.rows] == [*product(*GRID.values())]
     plan, row = wholearm.solve(box.with_(torque_limit=1.0, mass=0.25)), result.rows[3]
     assert row["value"] == plan.value and row["duration1"] == plan.phases[0].duration
     assert row["status"] == "planned" and row["verify"] == "ok"
@@ -107,8 +106,9 @@ def test_a_row_that_crashes_is_done_again(box: Problem, tmp_path: Path) -> None:
 
 
 def test_samples_are_a_latin_hypercube(box: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    none = {"status": "failed", "value": None, "reason": ""}
-    monkeypatch.setattr(Planner, "run", lambda *_: none)
+    monkeypatch.setattr(
+        Planner, "run", lambda *_: {"status": "failed", "value": None, "reason": ""}
+    )
     drawn = partial(sweep, box, {"mass": (0.1, 0.3), "epsilon": (0.0, 0.1)}, start=ONE, samples=8)
     rows = drawn(seed=1).rows
     for name, low, high in (("mass", 0.1, 0.3), ("epsilon", 0.0, 0.1)):
@@ -136,9 +136,8 @@ def test_goals_and_words_are_varied_too(box: Problem, monkeypatch: pytest.Monkey
 def test_values_are_read(text: str) -> None:
     with pytest.raises(InputError, match="--vary"):
         read_vary([text])
-    assert read_vary(["x=1:2:3", "flush=0,1", "control_hold=linear"]) == {
-        "x": (1.0, 1.5, 2.0), "flush": (0, 1), "control_hold": ("linear",)
-    }  # fmt: skip
+    values = read_vary(["x=1:2:3", "flush=0,1", "control_hold=linear"])
+    assert values == {"x": (1.0, 1.5, 2.0), "flush": (0, 1), "control_hold": ("linear",)}
     assert read_vary(["x=.5:2"], samples=5) == {"x": (0.5, 2.0)}
     assert read_vary(["fingers_collide=true,false"]) == {"fingers_collide": (True, False)}
 
@@ -151,7 +150,6 @@ def test_values_are_read(text: str) -> None:
         ({"finger.1.length": [0.1]}, "there is no 'finger'; did you mean 'fingers'"),
         ({"phases[2].until.x": [0.1]}, "there is no number 2; the list has 1"),
         ({"goal.x": [0.1]}, "--vary goal.x: there is no 'goal'"),
-        ({"mass": [-1.0, 0.2, 0.3]}, "--vary mass: -1.0 is not a positive number"),
         ({"mass": [0.2, np.nan, 0.3]}, "--vary mass: nan is not a positive number (finite)"),
         ({"friction_palm": [0.1, 20.0]}, "--vary friction_palm: 20 given; allowed are 0 to 10"),
         ({"control_hold": ["linear", "cubic"]}, "--vary control_hold: 'cubic' given; allowed are"),
@@ -239,9 +237,8 @@ def test_the_command_writes_table_and_figure(
     monkeypatch.setattr("wholearm.common.parallel.Processes", lambda jobs: ThreadPoolExecutor(1))
     given = ["sweep", box.source, "--vary", "mass=0.2:0.3:2", "--no-replay"]
     assert main([*given, "--figure", "mass.png"]) == 0
-    assert {file.name for file in tmp_path.iterdir()} == {
-        "box_sweep_mass.csv", "box_sweep_mass.jsonl", "mass.png"
-    }  # fmt: skip
+    names = sorted(file.name for file in tmp_path.iterdir())
+    assert names == ["box_sweep_mass.csv", "box_sweep_mass.jsonl", "mass.png"]
     assert "2 of 2 points planned" in capsys.readouterr().out
     table = Path("box_sweep_mass.csv").read_text()
     assert main([*given, "--json"]) == 0

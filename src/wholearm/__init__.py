@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 __version__ = "0.1.0"
@@ -32,6 +33,11 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     # As `from .module import name` does, which may be a module, too.
     value = getattr(__import__(_MODULES[name], globals(), None, [name], 1), name)
+    if isinstance(value, FunctionType):
+        from .common.arguments import checked
+
+        value = checked(value)
+        value.__module__ = __name__  # where it is found when it is pickled
     globals()[name] = value
     return value
 

@@ -36,6 +36,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from .document import describe_differences, find_differences
 from .errors import InputError, name_file
+from .fields import Range
 from .signals import beat, held
 
 try:
@@ -57,7 +58,7 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-def share(tasks: Sequence[Task[_T]], jobs: int) -> list[_T]:
+def share(tasks: Sequence[Task[_T]], jobs: int | None) -> list[_T]:
     """Results of tasks, in their order.
 
     Processes are forked on Linux alone, where libraries bear it, if this one may have children and
@@ -67,10 +68,11 @@ def share(tasks: Sequence[Task[_T]], jobs: int) -> list[_T]:
     Parameters
     ----------
     tasks  without arguments. What they return has to be picklable.
-    jobs   most processes, this one included
+    jobs   most processes, this one included; as many as cores if None
     """
     global _sharing
-    count = min(jobs, len(tasks)) - 1
+    most = count_cores() if jobs is None else Range(1, 256).read(jobs, "jobs")
+    count = min(most, len(tasks)) - 1
     if count < 1 or _sharing or not can_fork():
         return [task() for task in tasks]
     _sharing, children = True, list[tuple[BaseProcess, Connection]]()

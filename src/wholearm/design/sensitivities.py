@@ -24,7 +24,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, SolverError, WholearmError
-from ..common.parallel import count_cores, share
+from ..common.parallel import share
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase, trace_phases
@@ -333,7 +333,7 @@ def find_sensitivities(
         names_of |= dict.fromkeys(range(first, last + 1), part)
     progress(f"{len(parameters)} numbers")
     tasks = [partial(_find_one, problem, goal, parts, ways, p) for p in parameters]
-    rows = share(tasks, jobs or count_cores())
+    rows = share(tasks, jobs)
     rows.sort(key=lambda row: -abs(row.percent) if math.isfinite(row.percent) else 0.0)
     value = combine(goal, [plan.value for plan in planning.plans])
     return Sensitivities(problem.name, goal.value, value, UNITS[goal], parts, tuple(rows))

@@ -14,6 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.errors import require_number
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.torque import place_rows
@@ -51,7 +52,7 @@ def write_mjcf(
     step : [s]  that of `Setting` when left out
     softness    factor of the time constants of contacts
 
-    InputError if a link has no thickness.
+    InputError if a link has no thickness, or a number is not positive.
     """
     scene, home = problem.scene, problem.start
     if plan is not None:
@@ -59,6 +60,8 @@ def write_mjcf(
         home = plan.z[0]
     root = Element("mujoco", model=problem.name)
     step = engine.Setting().step * scene.scales.time if step is None else step
+    for name, number in (("step", step), ("softness", softness)):
+        require_number(number, name, positive=True)
     _add_options(root, scene, step)
     world = add(root, "worldbody")
     reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))

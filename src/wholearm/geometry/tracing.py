@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -35,7 +36,7 @@ LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several tu
 
 
 @exclusive
-def load(path: str) -> Problem:
+def load(path: str | Path) -> Problem:
     """Read a problem file and check its phases geometrically, or raise an `InputError`."""
     problem = read_problem(path)
     check_phases(problem)

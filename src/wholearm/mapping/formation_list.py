@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array, Numbers, round_to
-from ..common.errors import InputError, require_number
+from ..common.errors import InputError, require_number, require_vector
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
@@ -77,7 +77,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """
     if len(poses) < 2:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
-    corners = [np.array(pose, dtype=float) for pose in poses]
+    corners = [require_vector(pose, "route", 2) for pose in poses]
     for x, phi in corners:
         PLACE.check("route", float(x), "m", problem.scene)
         TURN.check("route", math.degrees(phi), "degrees")

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.arguments import check_kinds
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source, read_share, require_number
+from ..common.errors import InputError, name_source, read_share, require_number, require_vector
 from ..common.fields import (
     NONNEGATIVE,
     NUMBER,
@@ -176,6 +177,9 @@ class Phase:
         """The phase's number for people, from 1."""
         return self.index + 1
 
+    def __post_init__(self) -> None:
+        check_kinds(Phase.__annotations__, vars(self))
+
 
 @declare(
     key("flush", "The edge that shall lie on the palm.", INDEX),
@@ -255,6 +259,8 @@ class Problem:
     goals: tuple[Goal, ...] = ()  # where the object shall come to lie, in place of phases
 
     def __post_init__(self) -> None:
+        with name_source(self.source):
+            check_kinds(Problem.__annotations__, vars(self))
         phases = tuple(
             phase
             if phase.formation.scene is self.scene
@@ -267,6 +273,7 @@ class Problem:
         from .read import check_problem
 
         with name_source(self.source):
+            object.__setattr__(self, "start", require_vector(self.start, "start", 5))
             check_problem(self)
         object.__setattr__(self, "checked", True)
 

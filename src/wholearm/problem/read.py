@@ -13,12 +13,13 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product, zip_longest
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source, require_number, require_vector, suggest
+from ..common.errors import InputError, name_source, require_number, suggest
 from ..common.fields import (
     NONNEGATIVE,
     NUMBER,
@@ -115,7 +116,7 @@ _PLACES = {
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
 
-def read_problem(path: str) -> Problem:
+def read_problem(path: str | Path) -> Problem:
     """Read and validate a problem file; whether each phase can be reached is not checked here.
 
     An `InputError` if it cannot be read, or for the first thing in it that is malformed.
@@ -158,8 +159,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
         scene = Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
         check_ranges(scene)
         start = _table(table["start"], "start", START)
-        _check_edge(scene, start["flush"], "start.flush")
-        z = place_start(scene, start["flush"], require_number(start["x"], "start.x"))
+        z = place_start(scene, start["flush"], start["x"])
         entries = table.get("phases", [])
         if not isinstance(entries, list):
             raise InputError("", "phases", f"{entries!r} is not a list of [[phases]]")
@@ -216,8 +216,11 @@ def _check_edge(scene: Scene, edge: object, key: str) -> None:
 def place_start(scene: Scene, flush: int, x: float) -> Array:
     """The configuration with edge `flush` on the palm and both fingers closed, shape (5,).
 
-    InputError if `x` [m], of the centroid, is out of its range, or a finger does not reach.
+    InputError if there is no such edge, `x` [m], of the centroid, is out of its range, or a finger
+    does not reach.
     """
+    _check_edge(scene, flush, "start.flush")
+    x = require_number(x, "start.x")
     PLACE.check("start.x", x, "m", scene)
     q = place_flush(scene, flush, x)
     try:
@@ -344,7 +347,7 @@ def check_problem(problem: Problem) -> None:
         value = field.read(getattr(problem, attribute), field.name)
         field.check(value, field.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
-    PLACE.check("start.x", float(require_vector(problem.start, "start", 5)[0]), "m", problem.scene)
+    PLACE.check("start.x", float(problem.start[0]), "m", problem.scene)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TextIO
 
 import numpy as np
@@ -131,7 +132,7 @@ class TorqueProfile:
         return TorqueProfile(breaks, np.stack([middle, half], axis=2))
 
 
-def read_torque_csv(path: str) -> TorqueProfile:
+def read_torque_csv(path: str | Path) -> TorqueProfile:
     """Read torques from a CSV file with the columns ``t,tau1,tau2`` (s, N m, N m).
 
     Torques are linear between rows; a repeated time is a step. Lines that begin with ``#`` are
@@ -140,6 +141,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
     InputError if the file cannot be read, a column is missing or there twice, a row has more values
     than columns, one is not a finite number, or the times do not start at 0 and increase.
     """
+    path = str(path)
     with _open(path) as stream:
         reader = csv.reader(stream)
         numbered = [

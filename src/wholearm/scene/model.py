@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.arguments import check_kinds
 from ..common.arrays import Array
 from ..common.errors import InputError, frozen
 from ..common.fields import (
@@ -368,6 +369,7 @@ class Scene:
     actuator_lag = _OfFingers()  # (2,) [s]: time constants of the motors
 
     def __post_init__(self) -> None:
+        check_kinds(Scene.__annotations__, vars(self))
         read_keys(self)
         # Messages name a finger by its place here, whatever it was made as.
         named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
