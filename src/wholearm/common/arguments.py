@@ -14,57 +14,39 @@ from .errors import InputError
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
-
 _ANY = {"Any", "Array", "ArrayLike", "Literal", "Planner", "object"}  # have checks of their own
-_SCALARS = {"None", "bool", "float", "int", "str"}
-_ALIASES = {"Torques": "TorqueProfile | Trajectory | Moved"}
-_SEVERAL = re.compile(r"tuple\[(\w+), (\w+|\.\.\.)\]")
-_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "None": ("None", lambda given: given is None),
-    "bool": ("True, False", lambda given: isinstance(given, bool)),
-    "str": ("a string", lambda given: isinstance(given, str)),
-    "int": (
-        "a whole number",
-        lambda given: isinstance(given, Integral) and not isinstance(given, bool),
-    ),
-    "float": ("a number", lambda given: isinstance(given, Real) and not isinstance(given, bool)),
-    "os.PathLike": ("a path", lambda given: isinstance(given, os.PathLike)),
-    "Path": ("a path", lambda given: isinstance(given, os.PathLike)),
-    "Callable": ("a function", callable),
-    "Mapping": ("a mapping", lambda given: isinstance(given, Mapping)),
-    "Sequence": (
-        "a list",
-        lambda given: isinstance(given, Iterable) and not isinstance(given, str | Mapping),
-    ),
-    "Moved": ("what has a trajectory", lambda given: "trajectory" in dir(given)),
-    "Law": ("a policy", lambda given: hasattr(given, "held")),
-}
+_SCALARS: dict[str, Any] = {
+    "None": type(None), "bool": bool, "str": str, "int": Integral, "float": Real
+}  # fmt: skip
+_TYPES = _SCALARS | {
+    "os.PathLike": os.PathLike, "Path": os.PathLike, "Callable": Callable, "Mapping": Mapping,
+    "Sequence": Iterable,
+}  # fmt: skip
+# Protocols: an attribute that tells them, and what is public and has it.
+_PROTOCOLS = {"Moved": ("trajectory", "Plan, Simulation, Report"), "Law": ("held", "Policy")}
+_TUPLE = re.compile(r"tuple\[(\w+), (\w+|\.\.\.)\]")
 
 
 def _fits(given: Any, kind: str) -> bool:
-    if several := _SEVERAL.fullmatch(kind):
-        right = isinstance(given, tuple | list) and all(_fits(one, several[1]) for one in given)
-        return right and (several[2] == "..." or len(given) == 2)
-    if kind in _KINDS:
-        return _KINDS[kind][1](given)
+    if items := _TUPLE.fullmatch(kind):
+        right = isinstance(given, tuple | list) and all(_fits(one, items[1]) for one in given)
+        return right and (items[2] == "..." or len(given) == 2)
+    if kind in _PROTOCOLS:
+        return _PROTOCOLS[kind][0] in dir(given)
+    if isinstance(given, bool) or (kind == "Sequence" and isinstance(given, str | Mapping)):
+        return kind == "bool"
+    if kind in _TYPES:
+        return isinstance(given, _TYPES[kind])
     return kind in (own.__name__ for own in type(given).__mro__)
-
-
-def _describe(kind: str) -> str:
-    if several := _SEVERAL.fullmatch(kind):
-        return f"{'several' if several[2] == '...' else 'two'} {several[1]}"
-    return _KINDS.get(kind, (kind,))[0]
 
 
 @lru_cache(maxsize=256)
 def _split(annotation: str) -> tuple[str, ...]:
     """The kinds that an annotation names, none if it allows what is not told by a name."""
-    for alias, meaning in _ALIASES.items():
-        annotation = re.sub(rf"\b{alias}\b", meaning, annotation)
-    if not _SEVERAL.search(annotation):
-        while "[" in annotation:
-            annotation = re.sub(r"\[[^][]*\]", "", annotation)
-    kinds = tuple(annotation.split(" | "))
+    text = re.sub(r"\bTorques\b", "TorqueProfile | Trajectory | Moved", annotation)
+    while "[" in text and not _TUPLE.search(text):
+        text = re.sub(r"\[[^][]*\]", "", text)
+    kinds = tuple(text.split(" | "))
     return () if _ANY & {*kinds} else kinds
 
 
@@ -77,19 +59,16 @@ def check_kinds(
     """
     for name, value in given.items():
         kinds = _split(annotations.get(name, "Any"))
-        if kinds and (scalars or not _SCALARS.issuperset(kinds)):
-            if not any(_fits(value, kind) for kind in kinds):
-                allowed = ", ".join(dict.fromkeys(map(_describe, kinds)))
-                raise InputError("", name, f"{value!r} given; allowed: {allowed}")
+        left = not kinds or (not scalars and {*kinds} <= _SCALARS.keys())
+        if not left and not any(_fits(value, kind) for kind in kinds):
+            allowed = ", ".join(_PROTOCOLS.get(kind, ("", kind))[1] for kind in kinds)
+            raise InputError("", name, f"{value!r} given; allowed: {allowed}")
 
 
 def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """A public function that names arguments of a wrong kind; scalars where it fails by them."""
-    known = {
-        name: each.annotation
-        for name, each in signature(function).parameters.items()
-        if each.kind is not each.VAR_POSITIONAL and each.kind is not each.VAR_KEYWORD
-    }
+    every = signature(function).parameters.items()
+    known = {name: own.annotation for name, own in every if "*" not in str(own)}
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
