@@ -247,6 +247,8 @@ def test_text_is_inside_and_apart_in_other_widths(width: float, trajectory: Traj
     for label, angle in (("phi", trajectory.q[-1, 2]), ("finger 2", trajectory.theta[-1, 1])):
         assert data_of(line_of(angles, label))[1][-1] == pytest.approx(np.degrees(angle))
     assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == trajectory.theta_dot[:, 0].max()
+    # Two digits side by side inside of a small object would read as one number.
+    assert plots.choose_numbers(np.array([[0, 0], [18.5, 0], [18.5, 22], [0, 22]]))[1][0] > 0
 
 
 def test_simulation_is_drawn_over_the_plan(trajectory: Trajectory) -> None:
