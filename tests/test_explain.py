@@ -191,16 +191,15 @@ def test_data_say_what_the_text_says(which: str, request: pytest.FixtureRequest)
         assert str(change) in str(error)
 
 
-def test_a_change_can_be_made(along: errors.InfeasibleError) -> None:
+@pytest.mark.parametrize("robust", [0.0, 1.0])
+def test_a_change_can_be_made(robust: float) -> None:
     """By the keys that `with_` takes."""
-    assert along.changes
-    for change in along.changes:
-        own = change.parameter
-        assert (
-            solve(pressing(6.0).with_({own.key: change.value}), intervals=20, replay=False).value
-            > 0
-        )
-        assert (change.value > own.value) == (own.sign > 0)
+    changes = ask_plan(pressing(6.0), intervals=20, robust=robust).changes
+    assert changes
+    for own, value in changes:
+        changed = pressing(6.0).with_({own.key: value})
+        assert solve(changed, intervals=20, robust=robust, replay=False).value > 0
+        assert (value > own.value) == (own.sign > 0)
 
 
 def test_the_motion_missing_least_is_there(along: errors.InfeasibleError, tmp_path: Path) -> None:

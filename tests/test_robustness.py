@@ -45,7 +45,9 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import dynamics
 from wholearm.mechanics.sensitivity import Sensitivity, find_slopes_at
 from wholearm.mechanics.statics import Statics
+from wholearm.planning.path_domain import path_plan
 from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.refinement import refine
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import NAMES, PARAMETERS
@@ -484,6 +486,17 @@ def test_a_robust_plan_keeps_epsilon_in_every_corner(
     # A plan that touches its limits somewhere gives away little.
     assert robust < EPSILON + 0.5 * swing
     assert own[1].value < own[0].value < 1.1 * own[1].value
+
+
+def test_without_an_accurate_robust_plan_there_is_a_rough_one(
+    curves: tuple[Curve, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stall(first: path_plan.PathIterate, accuracy: float) -> path_plan.PathIterate:
+        return refine(first, accuracy, 40 if accuracy >= 1e-2 or not first.task.guides else 0)
+
+    monkeypatch.setattr(path_plan, "refine", stall)
+    plan = plan_path(curves[0], EPSILON, PlanOptions(ranges=RADII, accuracy=1e-6), 1)
+    assert 1e-6 < plan.error < 1e-2
 
 
 def add_ranges(ranges: object) -> Problem:

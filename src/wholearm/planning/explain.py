@@ -46,7 +46,7 @@ from .dwell import require_hold
 from .nlp import open_ledger, setting
 from .options import PlanOptions
 from .path_domain.path_data import fit_torque
-from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, plan_task
+from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves
 from .phase_plan import Piece, Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -261,11 +261,12 @@ def _find_least(task: Task, parameter: Parameter) -> float | None:
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
-    """Plan along the same curves with another value of a parameter, roughly."""
+    """Plan along the same curves with another value of a parameter, roughly, and all else anew."""
     task = _change_task(task, parameter, value)
     if task.find_fastest() is None:
         raise SolverError("no motion keeps the limits")
-    return plan_task(replace(task, options=task.options.roughen()))
+    task = replace(task, options=task.options.roughen(), guides=())
+    return plan_curves(task, explained=False)
 
 
 def list_frictions(formation: Formation) -> list[Parameter]:

@@ -121,9 +121,13 @@ def _plan_within(task: Task) -> PathIterate:
     """Plan; with a reference by successive linearization, each about the motion of the one before.
 
     Violations by other signs than those of the rows are tightened; if that costs too much, again.
+    The first plan is a rough one, whose few nodes have few of them: many may leave no plan at all.
+    Case: three phases of a pentagon within half its usual ranges.
     """
-    iterate = plan_task(task)
-    for _ in range(2 if task.guides else 0):  # most further ones
+    if not task.guides:
+        return plan_task(task)
+    iterate = plan_task(replace(task, options=task.options.roughen()))
+    for _ in range(3):  # most further ones
         if iterate.error <= task.options.accuracy:
             break
         try:
@@ -133,7 +137,7 @@ def _plan_within(task: Task) -> PathIterate:
         if other.objective >= iterate.objective:
             break
         iterate = other
-    return iterate
+    return replace(iterate, task=replace(iterate.task, options=task.options))
 
 
 def _leave_rest(iterate: PathIterate) -> Plans:
