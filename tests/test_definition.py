@@ -20,13 +20,14 @@ import pytest
 
 import wholearm
 from rows import each
-from shipped import BOX, FOLDER, HEPTAGON, Edit, plan_of, problem_of, put, table_of
+from shipped import BOX, FOLDER, HEPTAGON, LANDING, Edit, plan_of, problem_of, put, table_of
 from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import main
 from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
 from wholearm.common.fields import key as declare_key
 from wholearm.common.parallel import share
-from wholearm.geometry.tracing import trace_phases
+from wholearm.geometry.path_guess import find_end
+from wholearm.geometry.tracing import check_phases, trace_phase, trace_phases
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.plan import solve
 from wholearm.problem import read
@@ -285,6 +286,18 @@ def test_not_toml(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"is not TOML|is nested too deeply"):
         read_problem(str(path))
+
+
+def test_what_depends_on_where_a_landing_ends_is_left_to_the_planner() -> None:
+    problem = problem_of(LANDING)
+    z = problem.start
+    for phase in problem.phases:
+        z = find_end(phase, z, problem.phases[phase.number :])
+    last = {"contacts": ["v1-palm", "v2-palm", "v4-finger1", "v6-finger2"], "until": {"x": z[0]}}
+    longer = problem.with_(phases=[*problem.table["phases"], last])
+    check_phases(longer)
+    with pytest.raises(InputError, match="holds already at the start"):
+        trace_phase(longer.phases[-1], z)
 
 
 def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:

@@ -44,14 +44,23 @@ def load(path: str | Path) -> Problem:
 
 
 def check_phases(problem: Problem) -> None:
-    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
+    """Raise an `InputError` if a formation does not touch, or an `until` is never reached.
+
+    An `until` after a phase that may end at several places is left to the planner, which chooses.
+    """
     from .path_guess import find_end
 
     curves = trace_phases(problem)
-    z = curves[-1].end if curves else problem.start
+    z, chosen = curves[-1].end if curves else problem.start, False
     with name_source(problem.source):
         for phase in problem.phases[len(curves) :]:
-            z = find_end(phase, z, problem.phases[phase.index + 1 :])
+            try:
+                z = find_end(phase, z, problem.phases[phase.index + 1 :])
+            except InputError as error:
+                if chosen and error.key.endswith("until"):
+                    return
+                raise
+            chosen = chosen or phase.formation.n_constraints + phase.until.conditions < 5
 
 
 @lru_cache(maxsize=8)

@@ -93,6 +93,11 @@ class Until:
         """Rows of z that are given where the phase ends, and their values."""
         return tuple((ROWS[name], value) for name, value in self.coordinates)
 
+    @property
+    def conditions(self) -> int:
+        """How many conditions hold where the phase ends."""
+        return len(self.coordinates) + (self.contact is not None)
+
     def measure_pins(self, z: Array, length: float) -> float:
         """How far z, shape (5,), is from the pins at most, x over a `length` and phi in rad."""
         return max((_find_way(pin, z, length) for pin in self.pins), default=0.0)

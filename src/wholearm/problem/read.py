@@ -456,7 +456,7 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
     freedoms = 5 - phase.formation.n_constraints
     if len({name for name, _ in ends}) < len(ends):
         raise InputError("", key, f"{until} gives a coordinate twice")
-    if freedoms > 1 and (count := len(ends) + (until.contact is not None)) > freedoms:
+    if 1 < freedoms < (count := until.conditions):
         text = f"{until} gives {count} conditions; allowed are {freedoms}, as the contacts leave"
         raise InputError("", key, f"{text} {freedoms} freedoms")
 
