@@ -13,9 +13,12 @@ import pytest
 import wholearm
 from wholearm import InfeasibleError, InputError, PlanOptions, Problem, find_sensitivities
 from wholearm.cli.command import main
+from wholearm.common.arrays import Array
+from wholearm.design import sensitivities
 from wholearm.design.hand import Design, Hand, design_hand, read_choices
 from wholearm.design.sweep import find_parameter, list_parameters, require_allowed
 from wholearm.figures.result_figures import draw_search
+from wholearm.planning.options import Objective
 
 UNITS = {
     "": (0, 0, 0), "kg": (0, 1, 0), "m": (1, 0, 0), "N": (1, 1, -2), "N m": (2, 1, -2),
@@ -86,6 +89,19 @@ def test_sides_without_a_plan_are_said(box: Problem) -> None:
     # Without friction there is no less of it.
     row = find_sensitivities(box.with_(friction_palm=0.0), names=["friction_palm"], jobs=1).rows[0]
     assert row.note.startswith("with more only: ") and math.isfinite(row.derivative)
+
+
+def test_a_kink_has_the_derivative_with_more(box: Problem) -> None:
+    mass = find_parameter(box, "mass", "--of")
+
+    def evaluate(changed: Problem, z: Array) -> tuple[sensitivities.Terms, Array]:
+        more = changed.table["object"]["mass"] - mass.value
+        return [("1", "", 1 + max(2 * more, -3 * more))], z
+
+    ways = [("differences", 1e-3, evaluate(box, box.start)[0], evaluate)]
+    row = sensitivities._find_one(box, Objective.TIME, ["1"], ways, mass)
+    assert row.derivative == pytest.approx(2.0)
+    assert row.note == "with more only: with less the derivative is -3"
 
 
 def test_the_largest_margin_is_differenced(box: Problem) -> None:

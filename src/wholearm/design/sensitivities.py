@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -47,7 +48,8 @@ Terms = list[tuple[str, str, float]]
 """Parts of a Lagrangian, or of a value: phases and limit that they come from, and how much."""
 Evaluate = Callable[[Problem, Array], tuple[Terms, Array]]
 """Terms of blocks for another problem, from a configuration (5,), and where they end."""
-Way = tuple[str, float, Evaluate]  # a method, its relative change of a number, and what it takes
+# A method, its relative change of a number, the terms without a change, and what it takes
+Way = tuple[str, float, Terms, Evaluate]
 ACCURACY = 1e-6  # of the plans: at 1e-4 the derivative by friction_palm of heptagon is 2 % off
 STEP, WIDE = 1e-4, 2.5e-3  # relative changes of a number, for Lagrangians and solved problems
 LEAST = 1e-2  # size that a number counts as having, over the scene's unit
@@ -316,21 +318,24 @@ def find_sensitivities(
 
     names_of = {phase.number: str(phase.number) for phase in problem.phases}
 
-    def solve(changed: Problem, _: Array) -> tuple[Terms, Array]:
-        plans = plan_blocks(changed, trace_phases(changed), options, lambda text: None).plans
-        return [(names_of[k], "", plan.value) for k, plan in enumerate(plans, 1)], problem.start
+    def list_values(made: Planning) -> Terms:
+        return [(names_of[k], "", plan.value) for k, plan in enumerate(made.plans, 1)]
 
-    ways: list[Way] = [("differences", WIDE, solve)]
-    try:
+    def solve(changed: Problem, _: Array) -> tuple[Terms, Array]:
+        made = plan_blocks(changed, trace_phases(changed), options, lambda text: None)
+        return list_values(made), problem.start
+
+    ways, middle = list[Way](), list_values(planning)
+    with suppress(SolverError):
         if multipliers:
-            ways.insert(0, ("multipliers", STEP, find_lagrangian(planning)))
-    except SolverError:
-        pass
-    middle = ways[0][2](problem, problem.start)[0]
+            evaluate = find_lagrangian(planning)
+            middle = evaluate(problem, problem.start)[0]
+            ways.append(("multipliers", STEP, middle, evaluate))
     parts = tuple(dict.fromkeys(part for part, *_ in middle))
     for part in parts:
         first, last = (int(part.split("-")[end]) for end in (0, -1))
         names_of |= dict.fromkeys(range(first, last + 1), part)
+    ways.append(("differences", WIDE, list_values(planning), solve))
     progress(f"{len(parameters)} numbers")
     tasks = [partial(_find_one, problem, goal, parts, ways, p) for p in parameters]
     rows = share(tasks, jobs)
@@ -345,25 +350,30 @@ def _find_one(
     """The sensitivity to one number, in the first way in which a side of it can be evaluated."""
     size, fault = max(abs(each.value), LEAST * each.scale), ""
     about = each.name, each.value, each.unit
-    for method, step, evaluate in ways:
+    for method, step, middle, evaluate in ways:
         sides, note = list[tuple[float, Terms]](), ""
-        for change, text in ((step, "with less only: "), (-step, "with more only: "), (0.0, "")):
-            if not change and len(sides) != 1:
-                continue
+        for change, text in ((step, "with less only: "), (-step, "with more only: ")):
             try:
                 changed = problem.with_({each.name: each.value + change * size})
                 sides.append((change * size, evaluate(changed, changed.start)[0]))
             except (WholearmError, ValueError) as error:
                 note, fault = f"{text}{error}", str(error)
-        if len(sides) < 2:
+        if not sides:
             continue
-        (high, more), (low, less) = sides
+        sides.append((0.0, middle))
         values = [
-            [sum(v for part, _, v in terms if part == name) for name in parts]
-            for terms in (more, less)
+            [sum(v for part, _, v in terms if part == name) for name in parts] for _, terms in sides
         ]
-        slope = (combine(goal, values[0]) - combine(goal, values[1])) / (high - low)
-        slopes = ((np.array(values[0]) - values[1]) / (high - low)).tolist()
+        totals = [combine(goal, of_parts) for of_parts in values]
+        if not note:
+            up, down = totals[0] - totals[2], totals[2] - totals[1]
+            # A kink or a turning point, by more than plans are off.
+            if abs(up - down) > max(abs(up) / 2, abs(down) / 2, 10 * ACCURACY * abs(totals[2])):
+                note = f"with more only: with less the derivative is {down / (step * size):.4g}"
+        k = -1 if note else 1
+        (high, more), (low, less) = sides[0], sides[k]
+        slope = (totals[0] - totals[k]) / (high - low)
+        slopes = ((np.array(values[0]) - values[k]) / (high - low)).tolist()
         acts = dict[str, float]()
         for sign, terms in ((1, more), (-1, less)):
             for _, limit, value in terms:
