@@ -21,8 +21,9 @@ import pytest
 import wholearm
 from rows import each
 from shipped import BOX, FOLDER, HEPTAGON, LANDING, Edit, plan_of, problem_of, put, table_of
-from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
+from wholearm import End, Goal, InfeasibleError, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import main
+from wholearm.common.arrays import Array
 from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
 from wholearm.common.fields import key as declare_key
 from wholearm.common.parallel import share
@@ -687,13 +688,24 @@ def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> N
         tilted.with_(epsilon=0.1)
 
 
-def least_time(corners: int, size: float, mass: float | None = None) -> float:
-    return solve(build_problem(tomllib.loads(write_template("own", corners, size, mass)))).value
+def least_time(corners: int, size: float, mass: float | None = None, *vertices: Array) -> float:
+    text = write_template("own", corners, size, mass, *vertices)
+    return solve(build_problem(tomllib.loads(text))).value
 
 
 @pytest.mark.parametrize("corners", [3, 4, 12])
 def test_a_template_plans_as_it_is(corners: int) -> None:
     assert least_time(corners, 0.05) > 0
+
+
+def test_a_template_of_other_corners_plans_or_is_refused() -> None:
+    """With another start, with less friction, or not at all."""
+    flat, tall = np.array([[0, 0], [1.2, 0], [0.1, 0.3]]), [[0, 0], [0.2, 0], [0.2, 3.0], [0, 3.0]]
+    for corners in (flat, np.array(tall)):
+        assert least_time(7, 0.05, None, corners) > 0
+    falls = np.array([[0.01, 0], [0.02, 0], [0.18, 0.05], [0.17, 0.1]])
+    with pytest.raises(InfeasibleError, match="have a plan: phase 1 is infeasible: c_n of "):
+        least_time(7, 0.05, None, falls)
 
 
 def test_templates_are_alike_in_every_size() -> None:

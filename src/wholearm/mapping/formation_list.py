@@ -6,7 +6,6 @@ import math
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations, product
 from typing import NamedTuple
@@ -14,7 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array, Numbers, round_to
-from ..common.errors import InputError, require_number, require_vector
+from ..common.errors import (
+    InfeasibleError,
+    InputError,
+    WholearmError,
+    require_number,
+    require_vector,
+)
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
@@ -503,8 +508,12 @@ def write_template(
 
     Raises
     ------
-    InputError  if a number is out of its range
+    InputError       if a number is out of its range
+    InfeasibleError  if no hand, start and friction that are tried have a plan for given corners
     """
+    from ..planning.explain import unadvised
+    from ..planning.plan import solve
+
     given = vertices is not None
     if vertices is not None:
         body = Polygon(vertices, 1.0)
@@ -518,17 +527,27 @@ def write_template(
         # Rounded, so that a corner above the centroid is at zero.
         vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
     few = polygon < 5
-    tried = [(few, 1.2 if few else 0.3)]
-    # For given vertices the hand and the start of others may do.
-    tried += product((True, False), (1.2, 0.8, 0.3, 0.0)) if given else ()
-    for wide, start in tried[:-1]:
-        with suppress(InputError):
-            return _write(name, vertices, size, weight, wide, start)
-    return _write(name, vertices, size, weight, *tried[-1])
+    first = 0.05, few, 1.2 if few else 0.3
+    if not given:
+        return _write(name, vertices, size, weight, *first)
+    # For given vertices the hand, the start or less friction may do.
+    failures = list[WholearmError]()
+    for each in [first, *product((0.05, 0.01), (True, False), (1.2, 0.8, 0.3, 0.0))]:
+        try:
+            text = _write(name, vertices, size, weight, *each)
+            with unadvised():
+                solve(build_problem(tomllib.loads(text)), accuracy=1e-2, replay=False)
+            return text
+        except WholearmError as error:
+            failures.append(error)
+    reason = next((e for e in failures if not isinstance(e, InputError)), failures[-1])
+    raise InfeasibleError(f"no hand and start that are tried have a plan: {reason}")
 
 
-def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:
-    """The file for one hand and a start, over the size."""
+def _write(
+    name: str, vertices: Array, size: float, weight: float, friction: float, few: bool, start: float
+) -> str:
+    """The file for one friction, hand, and start over the size."""
     scale, heavy = size / _SIZE, weight / _MASS
     finger = f"""\
 length = {_show((0.22 if few else 0.14) * scale)} # m, joint to tip centre
@@ -557,9 +576,9 @@ base = [{_show((-0.2 if few else -1.6) * size)}, {_show(-0.2 * size)}] # m, join
 {finger}
 
 [friction] # coefficient with the object
-palm = 0.05
-finger1 = 0.05
-finger2 = 0.05
+palm = {friction}
+finger1 = {friction}
+finger2 = {friction}
 
 [start]
 flush = 0 # this edge lies on the palm
