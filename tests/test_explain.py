@@ -81,7 +81,8 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
     )
     # With the contact that is gained there the object can be held, but not while it slows down.
     assert "none that bring it to rest at its end, x = 88.04 mm" in message
-    assert "hold the object there on v1-palm v2-finger1 v0-finger2 v3-finger1" in message
+    assert "hold the object there on v1-palm v2-finger1 v0-finger2 v3-finger1; end it" in message
+    assert "elsewhere (they can for x of 69.5 to 81." in message
 
 
 @pytest.fixture(autouse=True)

@@ -280,7 +280,7 @@ def test_the_keys_that_keep_a_phase_from_a_plan_are_named(heptagon: Problem) -> 
     free: Any = [SimpleNamespace(motion=SimpleNamespace(duration=0.125))]
     keys = "without torque_rate_limit = 80 and inf N m/s and actuator_lag = 0.002 s"
     with_free = explain_motors(problem.scene, problem.phases[:1], free, SolverError(error))
-    assert f"{keys} there is a plan of 0.125 s for phase 1; with that, none" in str(with_free)
+    assert f"{keys} there is a plan of about 0.12 s for phase 1; with that, none" in str(with_free)
     neither = explain_motors(problem.scene, problem.phases[:1], [], SolverError(error))
     assert str(neither) == f"{error}; so it is {keys}"
     assert str(explain_motors(heptagon.scene, (), [], SolverError(error))) == error

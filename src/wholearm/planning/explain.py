@@ -37,9 +37,10 @@ from ..common.errors import (
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, describe_pose
 from ..geometry.path_guess import count_freedoms
+from ..geometry.tracing import find_headings, trace_curve
 from ..mechanics.limits import EPSILON, PRESS, LimitSet, make_limits
 from ..mechanics.statics import Statics, pushes_one_way
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Phase, Problem, Until
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
@@ -446,8 +447,20 @@ def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
             raise InfeasibleError(
                 f"{text}, and none that bring it to rest at its {where}, and keep c_n >= "
                 f"{problem.epsilon:g} N until then, hold the object there on {names}; end it "
-                f"elsewhere, {advice}"
+                f"elsewhere{_find_holds(phase, touching, z, problem.epsilon)}, {advice}"
             )
+
+
+def _find_holds(phase: Phase, touching: Formation, z: Array, epsilon: float) -> str:
+    """Ends of a phase beside z, (5,), on a curve, at which torques that do not step can hold."""
+    places = list[float]()
+    for heading in find_headings(touching, z) if touching.n_constraints == 4 else ():
+        curve = trace_curve(touching, z, heading, Until())
+        for end in curve.evaluate(np.linspace(0.0, curve.length, 25)).z:
+            held = Statics(touching, end).torque_polygon()
+            if Statics(phase.formation, end).list_continuous(epsilon, held):
+                places.append(1e3 * end[0])
+    return f" (they can for x of {min(places):.3g} to {max(places):.3g} mm)" if places else ""
 
 
 def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
@@ -566,6 +579,6 @@ def explain_motors(
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
     lasts = sum(plan.motion.duration for plan in free)
-    text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
+    text = f"without {keys} there is a plan of about {lasts:.2g} s for {where}; with that, {error}"
     error.args = (text if free else f"{error}; so it is without {keys}",)
     return error

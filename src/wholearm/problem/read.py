@@ -410,7 +410,8 @@ def require_phases(problem: Problem) -> None:
         text = "is missing, and so is [goal], from which wholearm finds them; "
         text += "`wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
         if problem.goals:
-            text = "is missing; `wholearm route FILE` finds the [[phases]] that lead to the goal"
+            text = "is missing; `wholearm route FILE` finds the [[phases]] that lead to the goal: "
+            text += "put what it prints, as solve does, into the file"
         raise InputError(problem.source, "phases", text)
 
 
