@@ -244,9 +244,7 @@ def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
     assert text in caught.value.problem and "\n" not in str(caught.value)
 
 
-def test_ends_are_read_and_the_first_phase_may_let_go_of_what_touches() -> None:
-    problem = read_edited(both(put("phases.0.end", "impact"), put("phases.1.end", "rest")))
-    assert [phase.end for phase in problem.phases] == [End.IMPACT, *4 * [End.REST]]
+def test_the_first_phase_may_let_go_of_what_touches() -> None:
     names = ["v1-palm", "v2-finger1", "v5-finger2"]
     assert [*read_edited(put("phases.0.contacts", names)).phases[0].formation.names] == names
 
@@ -693,13 +691,9 @@ def least_time(corners: int, size: float, mass: float | None = None, *vertices: 
     return solve(build_problem(tomllib.loads(text))).value
 
 
-@pytest.mark.parametrize("corners", [3, 4, 12])
-def test_a_template_plans_as_it_is(corners: int) -> None:
-    assert least_time(corners, 0.05) > 0
-
-
-def test_a_template_of_other_corners_plans_or_is_refused() -> None:
-    """With another start, with less friction, or not at all."""
+def test_a_template_plans_as_it_is_or_is_refused() -> None:
+    """Of given corners with another start, with less friction, or not at all."""
+    assert all(least_time(corners, 0.05) > 0 for corners in (3, 4, 12))
     flat, tall = np.array([[0, 0], [1.2, 0], [0.1, 0.3]]), [[0, 0], [0.2, 0], [0.2, 3.0], [0, 3.0]]
     for corners in (flat, np.array(tall)):
         assert least_time(7, 0.05, None, corners) > 0

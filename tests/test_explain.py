@@ -192,14 +192,13 @@ def test_data_say_what_the_text_says(which: str, request: pytest.FixtureRequest)
         assert str(change) in str(error)
 
 
-@pytest.mark.parametrize("robust", [0.0, 1.0])
-def test_a_change_can_be_made(robust: float) -> None:
-    """By the keys that `with_` takes."""
-    changes = ask_plan(pressing(6.0), intervals=20, robust=robust).changes
+def test_a_change_can_be_made() -> None:
+    """By the keys that `with_` takes, and within ranges."""
+    changes = ask_plan(pressing(6.0), intervals=20, robust=1.0).changes
     assert changes
     for own, value in changes:
         changed = pressing(6.0).with_({own.key: value})
-        assert solve(changed, intervals=20, robust=robust, replay=False).value > 0
+        assert solve(changed, intervals=20, robust=1.0, replay=False).value > 0
         assert (value > own.value) == (own.sign > 0)
 
 

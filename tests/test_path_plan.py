@@ -70,10 +70,9 @@ STEPPING = Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,
 TOP, AT_BREAK = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
 CLOSED = [
     (Toy(constant(1.0)), math.sqrt(2.0)),
-    (Toy(constant(1.0), length=0.03), 2 * math.sqrt(0.03 / LIMIT)),
+    *((Toy(constant(1.0), length=own), 2 * math.sqrt(own / LIMIT)) for own in (0.03, 4.0)),
     (Toy(constant(1.0, 1.0)), 2 / math.sqrt(LIMIT - EPSILON)),
-    (Toy(constant(1.0), speed_limit=(0.3, np.inf)), 1 / 0.3 + 0.3 / LIMIT),
-    (Toy(constant(1.0), speed_limit=(1.2, np.inf)), 1 / 1.2 + 1.2 / LIMIT),
+    *((Toy(constant(1.0), speed_limit=(v, np.inf)), 1 / v + v / LIMIT) for v in (0.3, 0.7, 1.2)),
     (Toy(constant(1.0), speed_limit=(1.6, np.inf)), math.sqrt(2.0)),
     (Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing()),
     (STEPPING, (2 * TOP - AT_BREAK) / LIMIT + AT_BREAK / (LIMIT / 2)),
@@ -102,15 +101,6 @@ def test_motions_integrate_their_acceleration() -> None:
         assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-8)
 
 
-@pytest.mark.parametrize("length", [0.03, 1.0, 4.0])
-def test_least_time_is_bang_bang(length: float) -> None:
-    exact, plan = 2 * math.sqrt(length / LIMIT), Toy(constant(1.0), length=length).plan()
-    t = np.linspace(0, plan.motion.duration, 2001)
-    a = plan.motion.locate(t)[2].a
-    assert (np.abs(np.abs(a) - LIMIT) < 1e-3 * LIMIT).mean() > 0.95
-    assert (np.sign(a) == np.sign(exact / 2 - t))[np.abs(t - exact / 2) > 0.03 * exact].all()
-
-
 @pytest.mark.parametrize("weight", [0.1, 3.0, 50.0])
 def test_least_effort_of_a_free_run(weight: float) -> None:
     """In a fixed time it takes 12 L^2 / T^3; with w T this is least at T^4 = 36 L^2 / w."""
@@ -122,19 +112,8 @@ def test_least_effort_of_a_free_run(weight: float) -> None:
     assert plan.motion.duration == pytest.approx(duration, rel=3e-4)
     t = np.linspace(0.1, 0.9, 50) * duration
     line = 6 / duration**2 * (1 - 2 * t / duration)
-    np.testing.assert_allclose(
-        plan.motion.locate(t)[2].a, line, rtol=0, atol=0.01 * np.abs(line).max()
-    )
-
-
-@pytest.mark.parametrize("speed", [0.3, 0.7, 1.2])
-def test_joint_speed_limit_makes_a_trapezoid(speed: float) -> None:
-    plan, exact = Toy(constant(1.0), speed_limit=(speed, np.inf)).plan(), 1 / speed + speed / LIMIT
-    t = np.linspace(0, plan.motion.duration, 4001)
-    b = plan.motion.locate(t)[2].b
-    assert np.sqrt(b.max()) <= speed * (1 + 5e-7)
-    cruise = np.abs(t - exact / 2) < 0.4 * (1 / speed - speed / LIMIT)
-    np.testing.assert_allclose(np.sqrt(b[cruise]), speed, rtol=2e-3)
+    a, off = plan.motion.locate(t)[2].a, 0.01 * np.abs(line).max()
+    np.testing.assert_allclose(a, line, rtol=0, atol=off)
 
 
 @pytest.mark.parametrize("duration", [2.5, 3.0, 8.0])
@@ -147,14 +126,6 @@ def test_largest_margin_within_a_duration(duration: float) -> None:
     assert plan.motion.duration <= duration * (1 + 5e-7)
     t = np.linspace(0, plan.motion.duration, 1001)
     assert plan.motion.locate(t)[2].lam.min() == pytest.approx(plan.value, abs=1e-6)
-
-
-def test_inertia_that_steps_at_a_reversal() -> None:
-    """Inertia 1, then 2: the switch at 3/8, and the acceleration jumps at 1/2."""
-    motion = STEPPING.plan().motion
-    (gap,) = np.flatnonzero(np.diff(motion.grid.segment))
-    assert motion.grid.steps[gap] == 0.0
-    np.testing.assert_allclose(motion.profile.a[[gap, gap + 1]], [-LIMIT, -LIMIT / 2], rtol=1e-3)
 
 
 OBJECTIVES = ["time", "effort", "margin"]
@@ -180,7 +151,7 @@ def check_bound(curves: Sequence[Curve], epsilon: float, intervals: int, excess:
 
 def test_plans_come_near_the_bound(curves: tuple[Curve, ...]) -> None:
     """Along curves, where a vertex rolls, and through impacts."""
-    for curve in (curves[0], curves[2], curves[4], tip_on(0.5)):
+    for curve in (curves[0], curves[2], curves[3], curves[4], tip_on(0.5)):
         check_bound((curve,), EPSILON, 80, 2e-4)
     problem = problem_of(IMPACTS)
     chain = ImpactSequence(problem.phases, trace_phases(problem)).split()[0]
@@ -206,17 +177,6 @@ def test_two_halves_are_one_whole(objective: str) -> None:
     assert value == pytest.approx(one.value, rel=1e-4)
     middle = float(np.sqrt(np.interp(1.0, one.motion.grid.s, one.motion.profile.b)))
     assert np.sqrt(parts[0].motion.profile.b[-1]) == pytest.approx(middle, rel=1e-2)
-
-
-@pytest.mark.parametrize("phase", [0, 3])
-def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> None:
-    motion = plan_path(curves[phase], EPSILON, PlanOptions(intervals=80), 1).motion
-    samples = motion.evaluate(np.linspace(0, motion.duration, 4001))
-    near = np.hstack([samples.c_n - EPSILON, LIMIT - np.abs(samples.tau)]) < 1e-3
-    # All but the intervals in which it goes over from one limit to another; mostly two limits, of
-    # which one fixes the internal force.
-    assert (near.sum(axis=1) >= 1).mean() > 0.95
-    assert (near.sum(axis=1) >= 2).mean() > 0.75
 
 
 @pytest.mark.parametrize("phase, objective", [(0, "effort"), (4, "margin")])
@@ -476,9 +436,8 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
     duration = 0.1
     options = PlanOptions("margin", intervals=INTERVALS)
     least = plan_path(curves[0], 0.05, OPTIONS, 1).value
-    with pytest.raises(
-        InfeasibleError, match=f"^phase 1 is infeasible: duration = {duration:g} s is"
-    ) as caught:
+    refusal = f"^phase 1 is infeasible: duration = {duration:g} s is"
+    with pytest.raises(InfeasibleError, match=refusal) as caught:
         plan_path(curves[0], 0.05, options, 1, duration)
     advised = read_advice(str(caught.value))
     assert list(advised) == ["duration"]

@@ -339,9 +339,8 @@ def test_torques_are_sampled_and_held(torque: TorqueProfile, offset: float) -> N
     ticks = np.unique(ticks[ticks < 0.5])
     for start, stop in zip(ticks, [*ticks[1:], 0.5], strict=True):
         within = np.linspace(start, stop, 5)[:-1] + 1e-9
-        np.testing.assert_allclose(
-            held.at(within), np.tile(torque.at(ticks[ticks <= start][-1:]), (4, 1)), rtol=1e-12
-        )
+        expected = np.tile(torque.at(ticks[ticks <= start][-1:]), (4, 1))
+        np.testing.assert_allclose(held.at(within), expected, rtol=1e-12)
 
 
 def test_a_problem_brings_its_own_ranges(heptagon: Problem) -> None:
@@ -419,10 +418,8 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(which: str) -> None:
     forces = dynamics.inverse(way.formation, point, directions)
     along = Sensitivity.of_curve(way.formation, point, directions, forces)
     slopes = along.find_slopes([*names, "start_x"])[0] @ dynamics.stack_motion(a, b, squeeze)[0]
-    tau, here = (
-        forces.tau(a, b, squeeze)[0],
-        dynamics.Directions(directions.Xi[0], directions.sigma[0]),
-    )
+    tau = forces.tau(a, b, squeeze)[0]
+    here = dynamics.Directions(directions.Xi[0], directions.sigma[0])
     state = point.z[0], point.z_s[0] * np.sqrt(b), tau, here
     require_slopes(own, way.formation, state, names, slopes)
     size = np.sqrt(point.z_s[0, :3] ** 2 @ dynamics.metric_weights(own.scene)[:3])
