@@ -32,7 +32,10 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
     """The torques of a plan, a replay or a trajectory and its motion; None for torques alone."""
     if isinstance(what, TorqueProfile):
         return what, None
-    trajectory = what if isinstance(what, Trajectory) else what.trajectory
+    trajectory = what if isinstance(what, Trajectory) else getattr(what, "trajectory", None)
+    if not isinstance(trajectory, Trajectory):
+        reason = "allowed are a plan, a simulation, a report, a Trajectory and a TorqueProfile"
+        raise InputError("", "what", f"{what!r} given; {reason}")
     return trajectory.torque, trajectory
 
 
