@@ -24,6 +24,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.contact_limits import measure_gaps
 from wholearm.contacts.elemental import ContactPair, parse_contact
+from wholearm.problem.definition import Until
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Friction, Polygon, Scales, Scene
@@ -263,6 +264,18 @@ def test_torques_alone_are_followed_by_what_happens() -> None:
     # The simulation goes on after the first loss.
     assert report.whole.t[-1] == pytest.approx(0.8)
     assert report.whole.outcome.kind is OutcomeKind.ENDED
+    x, length = trajectory.z[trajectory.phase == 0][-1, 0], problem.scene.scales.length
+    for until, reason in (
+        # A phase also ends where it rests a little short of its end.
+        ({"value": x - 5e-4 * length}, "every contact holds, and 2 phases end"),
+        ({"value": x - 2e-3 * length}, "v2-finger1 is lost at t = 0.4 s, phase 1"),
+        ({"value": -1.0}, "phase 1 does not end: x = -1 m is not reached; nearest, at t = 0.8"),
+        ({"coordinate": "phi", "value": 0.01, "pins": (("x", x),)}, "phase 1 ends at x = "),
+    ):
+        end = Until(**{"coordinate": "x"} | until)
+        phases = dataclasses.replace(problem.phases[0], until=end), problem.phases[1]
+        free = verify_free(dataclasses.replace(problem, phases=phases), trajectory.torque)
+        assert any(text.startswith(reason) for text in (free.reason, *free.failures)), reason
 
 
 @each(
