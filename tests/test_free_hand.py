@@ -276,6 +276,7 @@ def test_torques_alone_are_followed_by_what_happens() -> None:
         phases = dataclasses.replace(problem.phases[0], until=end), problem.phases[1]
         free = verify_free(dataclasses.replace(problem, phases=phases), trajectory.torque)
         assert any(text.startswith(reason) for text in (free.reason, *free.failures)), reason
+        assert int(free.trajectory.phase[-1]) == len(free.phases) - 1
 
 
 @each(

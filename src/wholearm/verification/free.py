@@ -80,6 +80,7 @@ def verify_free(
     if plan is None:
         phases, failures = _follow(whole, allowed)
         warnings = [*beyond, *_list_misses(whole, phases, MISSED), *warnings]
+        whole = whole.count_phases([phase.start for phase in phases])
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
     failures, alone = [*beyond, *_list_misses(whole, by_clock, allowed)], []
@@ -161,6 +162,7 @@ def verify_policy(
     if len(phases) == count and far:
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
+    whole = whole.count_phases([phase.start for phase in phases])
     return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), tuple(warnings))
 
 
