@@ -383,7 +383,8 @@ class FreeRun(Run):
             if moved and self.stands:
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
-                self.note(EventKind.GIVEN_UP, "decisions do not end")
+                names = " ".join(self.system.names[pair] for pair in closed.pairs)
+                self.note(EventKind.GIVEN_UP, f"decisions on {names or 'joints'} do not end")
                 return
             failure = "no motion obeys the laws of contact" if rests is None else ""
             self.resting = self.resting if rests is None else rests

@@ -87,13 +87,15 @@ def verify_free(
     for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
-        warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
-        failures += [] if part.outcome.kind is OutcomeKind.ENDED else [part.outcome.text]
+        names = name_phases([phase.number for phase in compared])
+        warnings += warn(f"{names} alone", part)
+        if part.outcome.kind is not OutcomeKind.ENDED:
+            failures.append(f"{names} alone: the simulator gave up, as {part.outcome.text}")
         for phase in compared:
             title, end = f"phase {phase.number} alone", phase.deviation
             failures += [f"{title}: {loss.describe()}" for loss in phase.losses]
             assert end is not None
-            if end.measure(problem.scene.scales.length) > allowed:
+            if phase.reached and end.measure(problem.scene.scales.length) > allowed:
                 away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
                 failures.append(f"{title} ends {away}")
     both = tuple(alone), tuple(by_clock)
