@@ -574,7 +574,7 @@ def test_a_plan_that_jams_in_its_replay_is_refused(monkeypatch: pytest.MonkeyPat
         solve(part_of(problem_of(HEPTAGON), 0, 2), intervals=10)
     text = str(caught.value)
     assert text.startswith("the plan of phase 2 does not hold in its replay: v1-palm jams in phase")
-    assert " at t = 0.1 s; " in text and "--no-replay" in text
+    assert " at t = 0.1 s; it is planned to end at t = 0.2" in text and "--no-replay" in text
 
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
