@@ -24,6 +24,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.contact_limits import measure_gaps
 from wholearm.contacts.elemental import ContactPair, parse_contact
+from wholearm.problem.definition import Until
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Friction, Polygon, Scales, Scene
@@ -92,19 +93,31 @@ def pinch(torque: float, until: float = 10.0) -> tuple[Problem, TorqueProfile, A
     return problem, profile, z
 
 
-def test_a_pinched_square_does_not_creep() -> None:
+def test_a_pinched_square_does_not_creep_and_bad_calls_are_told() -> None:
     problem, torque, z = pinch(0.3)
-    run = simulate_free(problem, torque)
+    # A short piece means nothing beyond its end.
+    coefficients = np.tile(torque.coefficients * [1.0, 0.0, 0.0], (2, 1, 1))
+    coefficients[0] += np.outer([1.0, -1.0], [0.02, 0.0, -0.02])
+    run = simulate_free(problem, TorqueProfile(np.array([0.0, 1e-7, 10.0]), coefficients))
     assert (run.z == run.z[0]).all() and (run.z_dot == 0).all() and run.t[-1] == 10.0
     assert run.z[0] == pytest.approx(z, abs=1e-13)
     assert [event.kind for event in run.events] == [EventKind.REST]
+    with pytest.raises(SimulationError, match=r"finger 1 and object overlap by 0\.01 m at"):
+        simulate_free(problem, torque, start=z + np.array([0.01, 0, 0, 0, 0]))
+    assert measure_gaps(problem.scene, z[None])[0, :3] == pytest.approx([0.05, 0, 0], abs=1e-13)
+    free = simulate(problem, torque, contacts="free", times=[0.0123])
+    assert 0.0123 in free.t and free.z[-1] == pytest.approx(run.z[-1], abs=1e-9)
+    for options in ({"contacts": "none"}, {"until": 1.0}, {"restitution": 0.5}):
+        with pytest.raises(InputError, match="contacts: "):
+            simulate(problem, torque, **options)
+    with pytest.raises(InputError, match="contacts: "):
+        verify(problem, torque, contacts="none")  # type: ignore[call-overload]
 
 
 def test_a_square_slips_when_no_friction_can_hold_it_any_more() -> None:
     # The lower corners, 0.06 m above the joints, need the least torque: tau = N (0.06 - mu radius).
-    problem, _, _ = pinch(0.3)
     falling = TorqueProfile(np.array([0.0, 1.0]), np.array([[[0.15, -0.15], [-0.15, 0.15]]]))
-    run = simulate_free(problem, falling)
+    run = simulate_free(pinch(0.3)[0], falling)
     starts = run.find(EventKind.START)
     least = 0.2 * 9.81 * (0.06 - 0.6 * 0.005) / (2 * 0.6)
     assert [event.time for event in starts] == pytest.approx([1 - least / 0.3], abs=1e-8)
@@ -252,17 +265,25 @@ def test_phases_of_a_plan_are_as_told_contact_by_contact() -> None:
 
 def test_torques_alone_are_followed_by_what_happens() -> None:
     problem, trajectory = begin()
-
-    def let_go(starts: Array, c: Array) -> Array:
-        c[starts > 0.2] *= -1
-        return c
-
-    report = verify_free(problem, change(trajectory.torque, let_go))
+    turned = change(trajectory.torque, lambda t, c: np.where(t[:, None, None] > 0.2, -c, c))
+    report = verify_free(problem, turned)
     assert not report.ok and report.exit_status == 1 and report.alone == ()
     assert report.phases[0].losses and report.phases[0].losses[0].time > 0.2
     # The simulation goes on after the first loss.
     assert report.whole.t[-1] == pytest.approx(0.8)
     assert report.whole.outcome.kind is OutcomeKind.ENDED
+    x, length = trajectory.z[trajectory.phase == 0][-1, 0], problem.scene.scales.length
+    for until, reason in (
+        # A phase also ends where it rests a little short of its end.
+        (Until(None, "x", x - 5e-4 * length), "every contact holds, and 2 phases end"),
+        (Until(None, "x", x - 2e-3 * length), "v2-finger1 is lost at t = 0.4 s, phase 1"),
+        (Until(None, "x", -1), "phase 1 does not end: x = -1 m is not reached; nearest, at"),
+        (Until(None, "phi", 0.01, (("x", x),)), "phase 1 ends at x = "),
+    ):
+        phases = dataclasses.replace(problem.phases[0], until=until), problem.phases[1]
+        free = verify_free(dataclasses.replace(problem, phases=phases), trajectory.torque)
+        assert any(text.startswith(reason) for text in (free.reason, *free.failures)), reason
+        assert int(free.trajectory.phase[-1]) == len(free.phases) - 1
 
 
 @each(
@@ -280,13 +301,6 @@ def test_numbers_out_of_range(options: dict[str, object], message: str) -> None:
         simulate_free(problem, torque, **options)
 
 
-def test_an_overlap_at_the_start_is_told() -> None:
-    problem, torque, z = pinch(0.3)
-    with pytest.raises(SimulationError, match=r"finger 1 and object overlap by 0\.01 m at"):
-        simulate_free(problem, torque, start=z + np.array([0.01, 0, 0, 0, 0]))
-    assert measure_gaps(problem.scene, z[None])[0, :3] == pytest.approx([0.05, 0, 0], abs=1e-13)
-
-
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, trajectory = begin()
     given, written, figure = (str(tmp_path / name) for name in ("a.npz", "b.npz", "c.png"))
@@ -301,18 +315,6 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert Path(figure).stat().st_size > 10_000
     for options in ("--reduced --free", "--restitution 0", "--uniqueness-margin 0 --free"):
         assert main(["verify", path, given, *options.split()]) == 2
-
-
-def test_one_function_simulates_under_both_rules() -> None:
-    problem, torque, _ = pinch(0.3)
-    free = simulate(problem, torque, contacts="free", times=[0.0123])
-    assert 0.0123 in free.t
-    assert free.z[-1] == pytest.approx(simulate_free(problem, torque).z[-1], abs=1e-9)
-    for options in ({"contacts": "none"}, {"until": 1.0}, {"restitution": 0.5}):
-        with pytest.raises(InputError, match="contacts: "):
-            simulate(problem, torque, **options)
-    with pytest.raises(InputError, match="contacts: "):
-        verify(problem, torque, contacts="none")  # type: ignore[call-overload]
 
 
 G = 9.81

@@ -345,8 +345,8 @@ class EngineDrive:
         self.loop, self.h, self.dry = loop, h, scene.dry[3:]
         self.feedback, self.begun = Feedback(loop, duration), 0  # and its pieces so far
         inertia = np.array([finger.inertia for finger in scene.fingers])
-        # Regularization speed of dry friction: ten times what it changes in a step.
-        self.creep = np.maximum(10.0 * self.dry * h / inertia, np.finfo(float).tiny)
+        # Dry friction is viscous below ten times the speed that it changes in a step.
+        self.viscous = inertia / (10.0 * h)
 
     def step(self, t: float, theta: Array, theta_dot: Array) -> Array:
         """Applied torques at a time, shape (2,) [N m]; times increase from zero."""
@@ -355,7 +355,7 @@ class EngineDrive:
             self.feedback.begin(self.begun, theta, theta_dot, {})
             self.begun += 1
         tau = torque.coefficients[self.begun - 1, :, 0]
-        return np.asarray(tau - self.dry * np.clip(theta_dot / self.creep, -1.0, 1.0))
+        return np.asarray(tau - np.clip(self.viscous * theta_dot, -self.dry, self.dry))
 
 
 PARTS = 5  # equal parts of a stretch at whose ends the error is listed

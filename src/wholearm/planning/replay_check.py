@@ -106,10 +106,11 @@ def replay_plan(
         if better is None:
             failed, reason = check.failure
             first = "" if number == failed else f", which departs in phase {number} first"
+            ends = f"planned to end at t = {planning.trajectory.phase_starts[failed]:.5g} s"
             raise ReplayError(
-                f"the plan of phase {failed} does not hold in its replay{first}: {reason}; other "
-                "intervals or another objective may do, and --no-replay (replay=False) leaves the "
-                "check out"
+                f"the plan of phase {failed} does not hold in its replay{first}: {reason}; it is "
+                f"{ends}; other intervals, another objective or time weight may do, and "
+                "--no-replay (replay=False) leaves the check out"
             )
         planning = better
     assert isinstance(check.report, Report)

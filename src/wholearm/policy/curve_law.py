@@ -431,7 +431,6 @@ class MotionLaw:
         self.passed = len(self.starts) - 1 if at_end else 0
         self.over = self.pushes = False
         self.rested = self.held = 0.0
-        self.left = [0.0] * len(self.ways)
 
     def step(
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
@@ -485,17 +484,13 @@ class MotionLaw:
         return torques[0], torques[1]
 
     def _hold(self, one: float, two: float) -> tuple[float, float]:
-        """Angle errors along displacements that are free at the end, once at rest plus integrals.
+        """Angle errors along displacements that are free at the end.
 
-        Those across them are errors of geometry.
+        Those across them are errors of geometry. Integrals would grow as long as friction holds
+        any error, until it slips.
         """
-        free_one = free_two = 0.0
-        for k, (p, q) in enumerate(self.ways):
-            off = p * one + q * two
-            self.left[k] += 30.0 * self.settings.period * off if self.over else 0.0
-            off += self.left[k]
-            free_one, free_two = free_one + p * off, free_two + q * off
-        return free_one, free_two
+        parts = [(p * one + q * two, p, q) for p, q in self.ways]
+        return sum(off * p for off, p, _ in parts), sum(off * q for off, _, q in parts)
 
     def _locate(self, t: float) -> tuple[int, float]:
         """Sample before a time, and the share of the interval after it."""

@@ -64,10 +64,10 @@ DWELL = FieldKind(
 """A time, or a share of the motion's."""
 
 
-def _find_way(place: tuple[str, float], z: Array, length: float) -> float:
-    """How far z, shape (5,), is from a coordinate's value, x over a `length` and phi in rad."""
+def _find_way(place: tuple[str, float], z: Array, length: float) -> Array:
+    """How far z, shape (5, ...), is from a coordinate's value, x over a `length` and phi in rad."""
     name, value = place
-    return float(abs(z[ROWS[name]] - value)) / (length if name == "x" else 1.0)
+    return np.asarray(np.abs(z[ROWS[name]] - value) / (length if name == "x" else 1.0))
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,10 @@ class Until:
         """How many conditions hold where the phase ends."""
         return len(self.coordinates) + (self.contact is not None)
 
-    def measure_pins(self, z: Array, length: float) -> float:
-        """How far z, shape (5,), is from the pins at most, x over a `length` and phi in rad."""
-        return max((_find_way(pin, z, length) for pin in self.pins), default=0.0)
+    def measure_pins(self, z: Array, length: float) -> Array:
+        """How far z, shape (5, ...), is from the pins at most, x over a `length` and phi in rad."""
+        ways = [_find_way(pin, z, length) for pin in self.pins]
+        return np.asarray(np.max(ways, axis=0, initial=0.0))
 
     def lead(self, z: Array, length: float) -> Until:
         """The same with the coordinate first that has the longest way from z, shape (5,).

@@ -383,7 +383,8 @@ class FreeRun(Run):
             if moved and self.stands:
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
-                return self._give_up("decisions do not end")
+                names = " ".join(self.system.names[pair] for pair in closed.pairs)
+                return self._give_up(f"decisions on {names or 'joints'} do not end")
             failure = "no motion obeys the laws of contact" if rests is None else ""
             self.resting = self.resting if rests is None else rests
             if rests:

@@ -199,6 +199,17 @@ class Simulation(Drawn):
         events = (event for event in self.events if event.kind in kinds)
         return tuple(event for event in events if phase is None or event.phase == phase)
 
+    def count_phases(self, starts: Sequence[float] | Array) -> Simulation:
+        """The same with phases that begin at given times [s], in their order."""
+        clock = np.asarray(starts)
+        owners = np.searchsorted(clock, [event.time for event in self.events], side="right") - 1
+        owned = zip(self.events, owners.tolist(), strict=True)
+        events = tuple(event._replace(phase=max(owner, 0)) for event, owner in owned)
+        # Of two rows at a boundary the first one ends the phase before.
+        twice = np.append(np.diff(self.t) == 0, False) & np.isin(self.t, clock[1:])
+        phase = np.maximum(np.searchsorted(clock, self.t, side="right") - 1 - twice, 0)
+        return replace(self, phase=phase, events=events)
+
     def show(self, contacts: Sequence[str]) -> Simulation:
         """The same with other columns of forces, NaN where a contact never pressed."""
         forces = np.full((2, len(self.t), len(contacts)), np.nan)

@@ -141,13 +141,20 @@ class Run(ABC):
         return self.decisions <= 60
 
     def tau(self, t: float) -> Array:
-        """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
-        coefficients = self.torque.coefficients[self.piece]
-        return np.asarray(coefficients @ self.fraction(t) ** np.arange(coefficients.shape[1]))
+        """Torques at `t`, as if they went on where they step next, shape (2,) [N m]."""
+        piece, t = self.piece, min(t, self.breaks[-1])
+        # Ramps between contact modes may be shorter than the time by which modes are judged ahead.
+        while t > self.breaks[piece + 1] and piece + 2 < len(self.breaks):
+            if self.feedback is not None or self.steps_at[piece + 1]:
+                break
+            piece += 1
+        coefficients, x = self.torque.coefficients[piece], self.fraction(t, piece)
+        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
 
-    def fraction(self, t: float) -> float:
+    def fraction(self, t: float, piece: int | None = None) -> float:
         """Coordinate of time `t` on the present piece of the torques, from -1 to 1 within it."""
-        start, stop = self.breaks[self.piece : self.piece + 2]
+        first = self.piece if piece is None else piece
+        start, stop = self.breaks[first : first + 2]
         return (2 * t - start - stop) / (stop - start)
 
     def time(self, x: float) -> float:

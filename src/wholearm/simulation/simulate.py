@@ -195,19 +195,13 @@ def _conclude(
         # Contacts that problem files have no name for are among the stretches alone.
         unnamed = re.compile("tip|joint|.*-(back|joint)")
         contacts += [n for n in used if n not in contacts and not unnamed.match(n)]
-        owners = np.searchsorted(clock, [event.time for event in events], side="right") - 1
-        owned = zip(events, owners.tolist(), strict=True)
-        events = [event._replace(phase=max(owner, 0)) for event, owner in owned]
-        # Of two rows at a boundary the first one ends the phase before.
-        twice = np.append(np.diff(t) == 0, False) & np.isin(t, clock[1:])
-        phase = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
     forces = np.full((2, len(records), len(names)), np.nan)
     for index, row in enumerate(records):
         forces[:, index, list(row.kept)] = row.c_n, row.c_t
     c_n, c_t = forces[:, :, [names.index(name) for name in contacts]]
     z, z_dot = y[:, :n], y[:, n : 2 * n]
     work, viscous, dry, contact = y[:, 2 * n :].T
-    return Simulation(
+    simulation = Simulation(
         t=t,
         z=z,
         z_dot=z_dot,
@@ -228,6 +222,7 @@ def _conclude(
         stretches=list_stretches(records, names),
         residual=run.residual,
     )
+    return simulation if clock is None else simulation.count_phases(clock)
 
 
 def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:

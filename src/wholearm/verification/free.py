@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.arrays import find_runs
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, name_phases, require_number
 from ..common.sharing import exclusive
@@ -22,14 +23,14 @@ from ..geometry.curve import describe_pose
 from ..geometry.tracing import EndDistance
 from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
-from ..problem.definition import Phase, Problem
+from ..problem.definition import End, Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.report import DEPARTURE, Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verify import MISSED, describe_misses, describe_motors
+from .verify import MISSED, REST_SPEED, describe_misses, describe_motors, measure_speed
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
@@ -79,19 +80,22 @@ def verify_free(
     if plan is None:
         phases, failures = _follow(whole, allowed)
         warnings = [*beyond, *_list_misses(whole, phases, MISSED), *warnings]
+        whole = whole.count_phases([phase.start for phase in phases])
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
     failures, alone = [*beyond, *_list_misses(whole, by_clock, allowed)], []
     for indices, part in simulate_phases(problem, plan, progress, **options):
         compared = _compare(plan, part, indices, allowed)
         alone += compared
-        warnings += warn(f"{name_phases([phase.number for phase in compared])} alone", part)
-        failures += [] if part.outcome.kind is OutcomeKind.ENDED else [part.outcome.text]
+        names = name_phases([phase.number for phase in compared])
+        warnings += warn(f"{names} alone", part)
+        if part.outcome.kind is not OutcomeKind.ENDED:
+            failures.append(f"{names} alone: the simulator gave up, as {part.outcome.text}")
         for phase in compared:
             title, end = f"phase {phase.number} alone", phase.deviation
             failures += [f"{title}: {loss.describe()}" for loss in phase.losses]
             assert end is not None
-            if end.measure(problem.scene.scales.length) > allowed:
+            if phase.reached and end.measure(problem.scene.scales.length) > allowed:
                 away = f"{end.position:.3g} m and {end.angle:.3g} rad away from the plan"
                 failures.append(f"{title} ends {away}")
     both = tuple(alone), tuple(by_clock)
@@ -160,6 +164,7 @@ def verify_policy(
     if len(phases) == count and far:
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
+    whole = whole.count_phases([phase.start for phase in phases])
     return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), tuple(warnings))
 
 
@@ -227,42 +232,61 @@ def _list_misses(simulation: Simulation, phases: Sequence[FreePhase], allowed: f
 
 def _follow(simulation: Simulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
     """Phases of torques alone: each until what ends it has happened."""
-    problem, phases = simulation.problem, list[FreePhase]()
-    failures: list[str] = []
+    phases, failures = list[FreePhase](), list[str]()
     start = float(simulation.t[0])
-    for phase in problem.phases:
-        stop = _find_end(simulation, phase, start)
+    for phase in simulation.problem.phases:
+        stop, failure = _find_end(simulation, phase, start, allowed)
         last = float(simulation.t[-1]) if stop is None else stop
         losses = find_losses(simulation, phase, start, last, allowed)
         phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
         failures += [loss.describe(phase.number) for loss in losses]
+        failures += [f"phase {phase.number} {failure}"] if failure else []
         if stop is None:
-            failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
             break
-        z = simulation.z[int(np.searchsorted(simulation.t, stop, side="right")) - 1]
-        if phase.until.measure_pins(z, problem.scene.scales.length) > allowed:
-            place = f"at {describe_pose(z)}, and not with {phase.until}"
-            failures.append(f"phase {phase.number} ends {place}")
         start = stop
     return tuple(phases), failures
 
 
-def _find_end(simulation: Simulation, phase: Phase, start: float) -> float | None:
-    """When a phase ends, None if it does not [s]."""
-    until, rows = phase.until, np.flatnonzero(simulation.t >= start)
-    later = [event for event in simulation.events if event.time >= start]
-    if until.contact is not None:
-        times = [e.time for e in later if e.contact == until.contact.name]
-        closed = [s for s in simulation.stretches if s.contact == until.contact.name]
-        times += [max(s.start, start) for s in closed if s.stop > start]
-    elif until.value is not None:
-        z = simulation.z[rows]
-        reached = EndDistance.to_leading(simulation.problem.scene, until, z[0]).measure(z) <= 0
-        times = simulation.t[rows[reached][:1]].tolist()
-    else:
+def _find_end(
+    simulation: Simulation, phase: Phase, start: float, allowed: float
+) -> tuple[float | None, str]:
+    """When a phase ends [s], None if it does not, and what is wrong with its end, if anything.
+
+    Open loop, what is brought to rest may stop a little short: a phase with an end at rest also
+    ends where it is slowest within `allowed` of it, over the scene's length or in rad.
+    """
+    problem, scene, rows = simulation.problem, simulation.problem.scene, simulation.t >= start
+    t, z, length = simulation.t[rows], simulation.z[rows], scene.scales.length
+    later, until = [e for e in simulation.events if e.time >= start], phase.until.lead(z[0], length)
+    if until.is_release:
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
-        times = [e.time for e in lost if e.contact in list_leaving(simulation.problem, phase)]
-    return min(times, default=None)
+        times = [e.time for e in lost if e.contact in list_leaving(problem, phase)]
+        return min(times, default=None), "" if times else "does not end: nothing is released"
+    end = EndDistance(scene, until, z[0])
+    left = end.measure(z)
+    if until.contact is None:
+        times = t[left <= 0].tolist()
+    else:
+        name, system = until.contact.name, build_system(scene)
+        gaps, inside = (part[:, system.names.index(name)] for part in system.measure(z))
+        left = np.maximum(gaps, -inside) / length
+        closed = [s for s in simulation.stretches if s.contact == name and s.stop > start]
+        times = [e.time for e in later if e.contact == name]
+        times += [max(s.start, start) for s in closed]
+    stop = min(times, default=math.inf)
+    if phase.end is End.REST:
+        away = np.maximum(left, until.measure_pins(z.T, length))
+        speed = np.array([measure_speed(scene, v) for v in simulation.z_dot[rows]])
+        rests = (away <= allowed) & (speed <= REST_SPEED * scene.scales.speed) & (t <= stop)
+        slowest = (t[run][speed[run].argmin()] for run in find_runs(rests) if run.start)
+        stop = float(next(slowest, stop))
+    if stop == math.inf:
+        row = int(left.argmin())
+        place = f"nearest, at t = {t[row]:.5g} s, it is {end.scale * left[row]:.3g} {end.unit} away"
+        return None, f"does not end: {phase.until} is not reached; {place}"
+    at = z[int(np.searchsorted(t, stop, side="right")) - 1]
+    beside = until.measure_pins(at, length) > allowed
+    return stop, f"ends at {describe_pose(at)}, and not with {phase.until}" if beside else ""
 
 
 def list_gained(problem: Problem, phase: Phase) -> set[str]:

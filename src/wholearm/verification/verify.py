@@ -452,7 +452,8 @@ def describe_failures(
         phase = problem.phases[event.phase]
         first, row = np.flatnonzero(simulation.phase == event.phase)[[0, -1]].tolist()
         z, v = simulation.z[row], simulation.z_dot[row]
-        if phase.until.measure_pins(z, scene.scales.length) > allowance.departure:
+        until = phase.until.lead(simulation.z[first], scene.scales.length)
+        if until.measure_pins(z, scene.scales.length) > allowance.departure:
             text = f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
             yield results.Failure(phase.number, text)
         fast = measure_speed(scene, v) > allowance.rest_speed * scene.scales.speed
@@ -463,7 +464,7 @@ def describe_failures(
             if scene.scales.length * turns[fastest] > speed:
                 body = ("the object", "finger 1", "finger 2")[fastest]
                 moves = f"{body} turns at {turns[fastest]:.3g} rad/s"
-            unit = EndDistance.to_leading(scene, phase.until, simulation.z[first]).unit
+            unit = EndDistance(scene, until, simulation.z[first]).unit
             text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
                 f"{event.value:.3g} {unit}/s at t = {event.time:.5g} s, while {moves}, with "
