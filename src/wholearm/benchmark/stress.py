@@ -647,7 +647,8 @@ def look(
             texts.append(f"{len(lines)} lines on stderr, beginning {err[:80]!r}")
         elif len(lines[0]) > 2000:
             texts.append(f"a line of {len(lines[0])} characters on stderr")
-        if out.strip():
+        told = "--json" in command and out.strip() and json.loads(out)["status"] == status
+        if out.strip() and not told:
             texts.append(f"exit status {status} with output {out[:80]!r}")
     if status == 2 and not any("mutant" in line for line in lines):
         texts.append(f"the file is not named in {err[:120]!r}")
