@@ -20,7 +20,7 @@ from wholearm.engines import engine_replay
 from wholearm.engines.engine_replay import EngineRun, list_pairs, list_steps, list_stretches
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
-from wholearm.results.adopt import require_same_phases
+from wholearm.results.adopt import adopt_motion
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import load_trajectory
 
@@ -278,7 +278,7 @@ def test_an_engine_that_is_missing_or_unknown(
 
 def test_what_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="not those of the problem"):
-        require_same_phases(slide()[0], plan_of(HEPTAGON))
+        adopt_motion(slide()[0], plan_of(HEPTAGON))
     command = ["export", str(HEPTAGON), "torques.csv", "--mjcf", str(tmp_path / "scene.xml")]
     assert main(command) == 2
     assert "torques alone given; a motion is needed" in capsys.readouterr().err

@@ -27,7 +27,7 @@ from ..common.parallel import DiedError, Journal, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import PARAMETERS, Phase, Problem, change_scene, read_widths
-from ..results.adopt import Torques, adopt_motion, require_same_phases
+from ..results.adopt import Torques, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
@@ -442,7 +442,6 @@ def assess_robustness(
     """
     problem, trajectory = adopt_motion(problem, plan)
     Range(1, 10**6).read(samples, "samples")
-    require_same_phases(problem, trajectory)
     trial_uncertainty = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, trial_uncertainty, phase, policy)
     with Journal(os.fspath(path or os.devnull), _stamp(trial, seed), fresh) as journal:

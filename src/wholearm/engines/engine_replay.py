@@ -43,7 +43,7 @@ from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..problem.read import read_own_problem
-from ..results.adopt import Moved, adopt_motion, require_same_phases
+from ..results.adopt import Moved, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Samples, Trajectory
 from ..scene.model import Scene
@@ -550,7 +550,6 @@ def replay_in(
     play = require_engine(engine)
     info = ENGINES[engine]
     problem, plan = adopt_motion(problem, plan)
-    require_same_phases(problem, plan)
     setting = setting or Setting()
     allowed = info.allowed if allowed is None else allowed
     plan = find_between(plan)

@@ -660,9 +660,6 @@ def make_policy(
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
     contact_speed = require_number(contact_speed, "contact_speed", positive=True)
-    if len(plan.phase_starts) != len(problem.phases) + 1:
-        text = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
-        raise InputError("", "phases of the plan", text)
     scales, limit = problem.scene.scales, problem.scene.torque_limit.tolist()
     if torque_limit is not None:
         limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2

@@ -53,10 +53,14 @@ def adopt_torques(
 
 
 def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
-    """Problem and motion as of `adopt_torques`; an `InputError` if torques alone are given."""
+    """Problem and motion as of `adopt_torques`.
+
+    InputError if torques alone are given, or the motion has other phases than the problem.
+    """
     problem, _, trajectory = adopt_torques(problem, plan)
     if trajectory is None:
         raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    require_same_phases(problem, trajectory)
     return problem, trajectory
 
 

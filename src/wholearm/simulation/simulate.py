@@ -229,6 +229,9 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     """Contact modes with which a plan begins, for the choice among several solutions."""
     system = build_system(problem.scene)
     names = [name for name, c in zip(plan.contacts, plan.c_n[row], strict=True) if c == c]
+    if odd := {*names} - {*system.names}:
+        text = f"{', '.join(sorted(odd))} of the plan are not of this scene"
+        raise InputError("", "contacts", text)
     kept = sorted(system.names.index(name) for name in names)
     z, v, a = plan.z[row], plan.z_dot[row], plan.z_ddot[row]
     rows = system.evaluate(z, v, kept)
