@@ -33,7 +33,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
 from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
-from .astar import EAGER, BorderBound, Route, RoutePlanner, RouteSearch
+from .astar import CAREFUL, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edge_plans import roughen
 from .edges import Blocked
@@ -251,7 +251,7 @@ NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
     f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
     "through cells that no straight way from rest shows to be possible, and what is further than "
-    f"{EAGER.most} places; phases may be as many as it takes"
+    f"{CAREFUL.most} places; phases may be as many as it takes"
 )
 
 
