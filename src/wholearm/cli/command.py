@@ -296,7 +296,6 @@ def _run(words: Sequence[str]) -> int:
     options = argparse.Namespace()
     try:
         options = build_parser(words).parse_args(words)
-        READ.clear()
         for given in (getattr(options, name) for name in options.inputs):
             paths = given if isinstance(given, list) else [given]
             READ.update(map(os.path.realpath, filter(None, paths)))
@@ -306,6 +305,7 @@ def _run(words: Sequence[str]) -> int:
             status: int = options.run(options)
         finally:
             _LINES.begin(0)
+            READ.clear()
         return status
     except WholearmError as error:
         if isinstance(error, InputError) and not error.source and hasattr(options, error.key):
