@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from functools import wraps
+from functools import cache, wraps
 from inspect import signature
 from typing import Any, ParamSpec, TypeVar
 
@@ -29,17 +29,23 @@ def _fits(given: Any, kind: str) -> bool:
     return kind in (own.__name__ for own in type(given).__mro__)
 
 
+@cache
+def _list_kinds(annotation: str) -> tuple[str, ...]:
+    """Kinds that an annotation of public classes and paths alone names; of others none."""
+    names = {*re.findall(r"\w+", annotation)} - {"tuple", "None"}
+    told = names - {"str"} and names <= {"str", "Path", *wholearm.__all__}
+    return tuple(annotation.split(" | ")) if told else ()
+
+
 def check_kinds(annotations: Mapping[str, str], given: Mapping[str, Any]) -> None:
     """Raise an `InputError` for the first value that is of none of the kinds of its annotation.
 
     Annotations that name other than public classes and paths are left to other checks.
     """
     for name, value in given.items():
-        text = annotations.get(name, "Any")
-        names = {*re.findall(r"\w+", text)} - {"tuple", "None"}
-        told = names - {"str"} and names <= {"str", "Path", *wholearm.__all__}
-        if told and not any(_fits(value, kind) for kind in text.split(" | ")):
-            raise InputError("", name, f"{value!r} given; allowed: {text.replace(' |', ',')}")
+        kinds = _list_kinds(annotations.get(name, "Any"))
+        if kinds and not any(_fits(value, kind) for kind in kinds):
+            raise InputError("", name, f"{value!r} given; allowed: {', '.join(kinds)}")
 
 
 def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:

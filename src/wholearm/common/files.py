@@ -22,9 +22,9 @@ LARGEST = 2**28  # largest array that is read [byte]: a million rows of everythi
 
 def require_writable(path: str | os.PathLike[str]) -> None:
     """Raise an `InputError`, before long work, if no file can be written at `path`."""
-    target = os.fspath(path)
-    folder = os.path.dirname(os.path.realpath(target))
-    if os.path.realpath(target) in READ:
+    target, resolved = os.fspath(path), os.path.realpath(path)
+    folder = os.path.dirname(resolved)
+    if resolved in READ:
         raise InputError(target, "", "cannot be written: this command reads it")
     if os.path.isdir(target):
         raise InputError(target, "", "cannot be written: is a folder")

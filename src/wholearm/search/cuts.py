@@ -23,12 +23,12 @@ from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, describe
 from ..mechanics.limits import EPSILON, make_limits
 from ..planning.explain import change_curve, find_changes, list_frictions, unadvised
-from ..planning.options import Objective, PlanOptions
+from ..planning.options import PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
 from .astar import EAGER, Route, RoutePlanner, RouteSearch
-from .edge_plans import ROUGH
+from .edge_plans import coarsen
 from .edges import DEPENDENT, Blocked, Chain, Edge, describe_steps, point_out
 from .places import make_place, require_reach
 from .roadmap import Roadmap
@@ -172,8 +172,7 @@ def _search_changed(
     changed, options = replace(changed, start=z), planner.options
     roadmap, start = Roadmap(changed, options.uniqueness_margin), make_place(changed.scene, z)
     search = RouteSearch(roadmap, start, planner.search.goal, sources=sources)
-    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
-    rough = replace(rough, mode_search=False, certify=False, replay=False)
+    rough = replace(coarsen(options), robust=0.0, mode_search=False, replay=False)
     planner = RoutePlanner(changed, None, search, rough, Reporter(None), first_only=True)
     try:
         planner.look_by(EAGER._replace(most=most))

@@ -69,7 +69,7 @@ PartPlan = list[tuple[Phase, TimeMotion | None]]
 """Planned phases of a part of a route, with pinned landings, and the motions of those over time."""
 
 
-def roughen(options: PlanOptions) -> PlanOptions:
+def coarsen(options: PlanOptions) -> PlanOptions:
     """Options of coarse plans, which do not depend on the objective and the accuracy."""
     return replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, certify=False)
 
@@ -104,7 +104,7 @@ def plan_coarsely(
     """
     from ..planning.time_domain.time_plan import try_phases
 
-    rough = roughen(options)
+    rough = coarsen(options)
     phases, z, spent = make_phases(problem, steps), edge.start.z, 0.0
     try:
         single = replace(problem, goals=(), phases=tuple(phases))

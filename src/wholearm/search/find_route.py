@@ -35,7 +35,7 @@ from ..problem.read import name_goal
 from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
 from .astar import CAREFUL, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
-from .edge_plans import roughen
+from .edge_plans import coarsen
 from .edges import Blocked
 from .places import is_at, make_place, require_reach
 from .roadmap import LONGEST, Roadmap
@@ -133,7 +133,7 @@ def get_roadmap(
 
     And everything that it depends on, as JSON. It keeps coarse plans, which depend on options.
     """
-    numbers = problem.epsilon, repr(roughen(options))
+    numbers = problem.epsilon, repr(coarsen(options))
     key = json.dumps(describe_scene(problem.scene) | {"": numbers}, sort_keys=True)
     roadmap = _roadmaps.pop(key, None)
     if roadmap is None and cache is not None:

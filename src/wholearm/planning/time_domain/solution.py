@@ -293,7 +293,7 @@ ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 # Options from there: of 152 successes one entered the restoration phase, of 41 failures 24, for
 # longer. Case: leg 6 of the corpus takes one iteration of it.
 GUESSED = {"max_resto_iter": 5}
-# Options of coarse plans: changes of the objective by less than their accuracy, with constraints
+# Options of coarse plans: they are accepted where the objective no longer changes, with constraints
 # kept. Cases: of 17 releases of queries 37, 10, 24, 33, 16, 0, 5 and 11 three have no plan
 # without these, others by rounding.
 ACCEPTED = {
