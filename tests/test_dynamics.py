@@ -30,7 +30,7 @@ from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.path_domain.path_plan import Task, plan_curves
-from wholearm.planning.time_domain.stage import in_own_units, unit_lengths
+from wholearm.planning.time_domain.stage import in_scene_units, unit_lengths
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
@@ -618,7 +618,7 @@ def test_planner_and_linear_programme_agree_on_what_rests(phase: int, ends: bool
     z = curve.end if ends else curve.evaluate(np.zeros(1)).z[0]
     cell, scene = problem.phases[phase], problem.scene
     low, high = 0.0, 200.0
-    own, scaled = in_own_units(problem), z / unit_lengths(problem.scene.scales)
+    own, scaled = in_scene_units(problem), z / unit_lengths(problem.scene.scales)
     while high - low > 1e-3:
         middle = (low + high) / 2
         held = Statics(own.phases[phase].formation, scaled).find_block(middle, ends)

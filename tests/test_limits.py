@@ -34,7 +34,7 @@ from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import choose_sampling, prepare
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
+from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, find_violations, run_checks
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
@@ -155,11 +155,11 @@ def test_another_limit_binds_over_time(
     worst = []
     for part in plain.motion.stages:
         stage = Stage(PHASE, part.formation, part.directions, part.points)
-        misses = find_misses(stage, check_between(stage, part), EPSILON)
+        violations = find_violations(stage, run_checks(stage, part), EPSILON)
         limits = make_limits(part.formation, EPSILON)
         of_motors = np.isin(limits.sides[0], limits.of("motor"))
-        assert misses.held[:, ~of_motors].max() < 2 * SETTINGS.miss
-        worst.append(misses.held[:, of_motors].max())
+        assert violations.sides[:, ~of_motors].max() < 2 * SETTINGS.violation
+        worst.append(violations.sides[:, of_motors].max())
     assert max(worst) == pytest.approx(before - 1, rel=2e-2)
 
 
@@ -176,8 +176,8 @@ def test_a_contact_that_begins_to_slide_is_inside_its_cone_until_then() -> None:
     least = 0.9 * float(used.max())
     weak = problem.with_(friction_palm=least, torque_rate_limit=1e4)
     formation = replace(part.formation, scene=weak.scene)
-    stage = Stage(1, formation, part.directions, part.points, fading=((row, 1.0),))
-    held = find_misses(stage, check_between(stage, part), EPSILON).held[-1]
+    stage = Stage(1, formation, part.directions, part.points, ending_constraints=((row, 1.0),))
+    held = find_violations(stage, run_checks(stage, part), EPSILON).sides[-1]
     limits = make_limits(formation, EPSILON)
     cones = np.isin(limits.sides[0], limits.of(CONE))
     short = (np.abs(samples.c_t[:, row]) - least * samples.c_n[:, row]).max()

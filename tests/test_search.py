@@ -33,7 +33,7 @@ from wholearm.mapping import formation_list
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.lower_bound import bound_least_time
-from wholearm.planning.time_domain.guesses import GIVEN
+from wholearm.planning.time_domain.guesses import PROBLEM_MODES
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
@@ -213,7 +213,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     for one, other in zip(printed.phases, again.phases, strict=True):
         assert (one.until, one.end, one.guess) == (other.until, other.end, other.guess)
     found = wholearm.solve(again, replay=False)
-    assert found.phases[over_time[0] - 1].attempt == GIVEN
+    assert found.phases[over_time[0] - 1].attempt == PROBLEM_MODES
     # The issue allows 1e-4; both refine to that accuracy.
     assert found.duration == pytest.approx(plan.duration, rel=1e-4)
 

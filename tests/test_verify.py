@@ -554,10 +554,10 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
     held, figures = replay_check.replay_plan(replace(planning, problem=slide), lambda _: None)
     assert figures.least_c_n.value > slide.epsilon
-    assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
+    assert (rise := held.extra_epsilon) == {0: pytest.approx(self_check.INCREASE * short, rel=0.05)}
     loss = 1 - planning.plans[0].value / held.plans[0].value
     assert 1e-3 < loss < held.plans[0].error < 2.5 * loss
-    assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
+    assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + rise[0], abs=1e-5)
 
 
 def test_a_plan_that_jams_in_its_replay_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

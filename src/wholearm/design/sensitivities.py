@@ -210,13 +210,13 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
     costliest = max(costs, key=lambda limit: costs[limit])
 
     def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
-        own, scales = stage.in_own_units(problem), problem.scene.scales
+        own, scales = stage.in_scene_units(problem), problem.scene.scales
         stages = [_adopt(each, own) for each in made.stages]
         nodes = points[0].nodes.copy()
         nodes[0, 0] = z / stage.unit_lengths(scales)
         stages[0] = replace(stages[0], guess=points[0]._replace(nodes=nodes))
         other = solution.TimeSearch(problem, options)
-        nlp, raised = other.build(stages), [stage.LimitMisses.none(each) for each in stages]
+        nlp, raised = other.build(stages), [stage.LimitViolations.none(each) for each in stages]
         bounds, bounds_g = time_nlp.find_bounds(nlp, stages, other.scheme, raised)
         x, written = time_nlp.pack(points, nlp.layouts, 0.0), nlp.assembled[0]
         # Without a price of the end.
@@ -232,11 +232,13 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
 
 def _adopt(part: stage.Stage, own: Problem) -> stage.Stage:
     """A stage in the scene of a problem in own units."""
-    until, ahead = own.phases[part.phase].until, part.ahead
-    if ahead is not None and until.value is not None:
-        ahead = ahead[0], until.value, ahead[2]
-    gained = part.gained and stage.make_formation(own.scene, *part.gained.equations[1:])
-    return replace(part.move_to(own.scene), gained=gained, until=part.until and until, ahead=ahead)
+    until, approach = own.phases[part.phase].until, part.approach
+    if approach is not None and until.value is not None:
+        approach = approach[0], until.value, approach[2]
+    part = replace(part.move_to(own.scene), until=part.until and until, approach=approach)
+    if (other := part.next_formation) is not None:
+        part = replace(part, next_formation=stage.make_formation(own.scene, *other.equations[1:]))
+    return part
 
 
 def find_lagrangian(planning: Planning) -> Evaluate:

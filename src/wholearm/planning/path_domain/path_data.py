@@ -19,7 +19,7 @@ from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
-from ..robust.robust_rows import RobustLimits, spread_limits
+from ..robust.robust_rows import RobustLimits, repeat_limits
 from .path_motion import Elements, Grid, PathMotion, Profile
 
 PLACES = 13  # interpolation points where torques of a motion are not those through the knots
@@ -172,7 +172,7 @@ def prepare(
     nodes, checks = every.pick(slice(None, len(grid.s))), Places(*map(interpolate, knots))
     limits = make_limits(formation, epsilon)
     if spread is not None:
-        limits = spread_limits(limits)
+        limits = repeat_limits(limits)
         inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
         nodes, checks = (

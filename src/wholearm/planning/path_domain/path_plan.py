@@ -34,7 +34,7 @@ from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration, value_of
 from ..refinement import SOLVES, refine
-from ..robust.robust_rows import Guide, RobustLimits, list_holds, measure_holds, spread
+from ..robust.robust_rows import Reference, RobustLimits, list_holds, measure_holds, robustify
 from .path_data import PhaseData, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
@@ -225,7 +225,7 @@ class Task:
     phases: Sequence[int]  # the phases' numbers, for messages
     duration: float | None = None  # [s]: longest one of all, for the objective `margin`
     start: SureStart | None = None
-    guides: tuple[Guide, ...] = ()  # with ranges a reference for each curve
+    guides: tuple[Reference, ...] = ()  # with ranges a reference for each curve
     pins: Pins = (None, None)
 
     @cached_property
@@ -234,7 +234,7 @@ class Task:
         if not self.guides:
             return [None] * len(self.curves)
         args = self.epsilon, self.options.ranges
-        return [spread(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
+        return [robustify(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
 
     @property
     def is_held(self) -> bool:
@@ -577,9 +577,9 @@ class PathIterate:
         return np.split(values, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
 
     @property
-    def guides(self) -> tuple[Guide, ...]:
+    def guides(self) -> tuple[Reference, ...]:
         """The motion along each curve as a reference."""
-        return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
+        return tuple(Reference(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property
     def misses(self) -> tuple[Array, Array, float]:

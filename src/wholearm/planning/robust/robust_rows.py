@@ -2,11 +2,11 @@
 
 In h c - sum over p of |d(h c - low)/dp| r_p >= low (README) the derivatives times r_p, the
 parametric bounds, are affine in 1, a = s'', b = s'^2, the internal force lambda and s'
-(`mechanics.sensitivity`). So the left side is the least of affine rows, one for each choice of
-signs. At a place with a known b they allow a polygon of a and lambda; a minimum-time
-motion is at its vertex of largest or least a. The rows that meet at these two are found by cutting
-planes: the most violated row is added. These `COPIES` rows for each limit are taken like any other
-limits. `PhaseData` evaluates the absolute values, so that tightening covers other signs between.
+(`mechanics.sensitivity`). So the left side is the minimum of affine rows, one for each choice of
+signs. At a place and with a value of b the rows bound a polygon of a and lambda; a minimum-time
+motion is at its vertex of largest or least a. The rows that meet at these two vertices are found by
+cutting planes: the most violated row is added. These `COPIES` rows for each limit are used like any
+other limits. `PhaseData` evaluates the absolute values: tightening covers other signs between.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.definition import PARAMETERS, change_scene
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
-_LOOKS = 97  # places of a segment at which signs are found
+_PLACES = 97  # places of a segment at which signs are determined
 
 
-class Guide(NamedTuple):
-    """Reference motion along a curve: places [m], s'', s'^2 and internal force [N] there."""
+class Reference(NamedTuple):
+    """Reference motion along a curve: places [m], and s'', s'^2 and internal force [N] there."""
 
     s: Array
     a: Array
@@ -45,9 +45,9 @@ class Guide(NamedTuple):
 class RobustLimits(NamedTuple):
     """Robust force limits of a curve."""
 
-    names: tuple[str, ...]  # parameters with a range that counts
+    names: tuple[str, ...]  # parameters with a range
     radii: Array  # (p,)
-    rows: Array  # (m, n_c + R): those of the force limits, h
+    rows: Array  # (m, n_c + R): rows h of the force limits
     s: Array  # (n,) [m]: places of the signs, segment by segment
     segment: Numbers  # (n,)
     signs: NDArray[np.int8]  # (n, m, COPIES, p)
@@ -62,23 +62,23 @@ class RobustLimits(NamedTuple):
     ) -> Array:
         """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
         slopes = Sensitivity.of_curve(formation, point, directions, forces).find_slopes(self.names)
-        given = formation, self.rows, self.names, slopes, forces.of_c, epsilon
-        return find_variations(*given) * self.radii[:, None]
+        changes = find_variations(formation, self.rows, self.names, slopes, forces.of_c, epsilon)
+        return changes * self.radii[:, None]
 
     def pick_signs(self, s: Array, segment: Numbers) -> NDArray[np.int8]:
-        """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
+        """Signs at places `s` of segments `segment`, shape (n, m, COPIES, p)."""
         rows = np.zeros(len(s), dtype=np.int64)
         for number in set(segment.tolist()):
-            here, table = (np.flatnonzero(each == number) for each in (segment, self.segment))
-            places = self.s[table]
-            rows[here] = table[np.searchsorted((places[1:] + places[:-1]) / 2, s[here])]
+            targets, sources = (np.flatnonzero(x == number) for x in (segment, self.segment))
+            places = self.s[sources]
+            rows[targets] = sources[np.searchsorted((places[1:] + places[:-1]) / 2, s[targets])]
         return self.signs[rows]
 
     def extend(self, of_c: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
-        """Contact forces with the robust value of each copy of each limit as further columns."""
-        spread = np.einsum("nmkp,nmpq->nmkq", signs, variations)
-        nominal = np.repeat(self.rows @ of_c, spread.shape[2], axis=1)
-        return np.concatenate([of_c, nominal - spread.reshape(nominal.shape)], axis=1)
+        """Contact forces, with the robust value of each copy of each limit as further columns."""
+        bounds = np.einsum("nmkp,nmpq->nmkq", signs, variations)
+        nominal = np.repeat(self.rows @ of_c, bounds.shape[2], axis=1)
+        return np.concatenate([of_c, nominal - bounds.reshape(nominal.shape)], axis=1)
 
     def evaluate(
         self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
@@ -98,17 +98,17 @@ def find_variations(
 ) -> Array:
     """Derivatives of force limits by p parameters, shape (n, m, p, k) [N per unit].
 
-    From rows h, (m, n_c + R), and k coefficients, the first of 1, of the slopes (n, n_c + R, p, k)
-    of forces and of these, (n, n_c + R, k). A cone's edge, mu (c_n - epsilon), is proportional to
-    its friction; c_n >= epsilon is free of that.
+    Of rows h, (m, n_c + R). Slopes of the forces, (n, n_c + R, p, k), and the forces `of_c`,
+    (n, n_c + R, k), have k coefficients, the first of 1. The edge of a cone, mu (c_n - epsilon), is
+    proportional to friction; c_n >= epsilon does not depend on it.
     """
     variations, count = np.einsum("mi,nipq->nmpq", rows, slopes), formation.n_contacts
     cones = (rows[:, count:] != 0).any(axis=1)[:, None]
     for k, name in enumerate(names):
         if name.startswith("friction"):
             part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
-            mine = [contact.finger == part for contact in formation.contacts]
-            edges = cones * rows[:, :count] * mine
+            is_part = [contact.finger == part for contact in formation.contacts]
+            edges = cones * rows[:, :count] * is_part
             variations[:, :, k] += edges @ of_c[:, :count]
             variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
     return np.asarray(variations)
@@ -119,10 +119,10 @@ def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
     return np.asarray(np.einsum("nmpq,nq->nmp", variations, stack_motion(*motion)))
 
 
-def spread_limits(limits: LimitSet) -> LimitSet:
-    """Limits with `COPIES` rows for each of the forces', in the columns that `extend` adds."""
+def repeat_limits(limits: LimitSet) -> LimitSet:
+    """Limits with `COPIES` rows for each force limit, in the columns that `extend` adds."""
     width = len(limits.of(PRESS, CONE)) * COPIES
-    wider, first = [], 0
+    repeated, first = [], 0
     for limit in limits.limits:
         forces, joints = limit.rows[:, :-4], limit.rows[:, -4:]
         rows = np.hstack([forces, np.zeros((len(forces), width)), joints])
@@ -130,93 +130,94 @@ def spread_limits(limits: LimitSet) -> LimitSet:
         if limit.kind in (PRESS, CONE):
             count, begin = len(rows) * COPIES, forces.shape[1] + first
             changes = {"rows": np.eye(rows.shape[1])[begin : begin + count], "drags": True}
-            repeated = ("low", "high", "weight")
-            changes |= {name: np.repeat(getattr(limit, name), COPIES) for name in repeated}
+            vectors = ("low", "high", "weight")
+            changes |= {name: np.repeat(getattr(limit, name), COPIES) for name in vectors}
             changes["text"] = f"{limit.text} within all ranges,"
             first += count
-        wider.append(replace(limit, **changes))
-    return LimitSet(tuple(wider))
+        repeated.append(replace(limit, **changes))
+    return LimitSet(tuple(repeated))
 
 
-def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, float]) -> RobustLimits:
-    """Robust force limits of a curve near a reference, for ranges of some radii but the delay."""
-    names = [each.name for each in PARAMETERS if widths.get(each.name, 0.0) > 0]
+def robustify(
+    curve: Curve, reference: Reference, epsilon: float, widths: Mapping[str, float]
+) -> RobustLimits:
+    """Robust force limits of a curve near a reference, for radii `widths` but that of the delay."""
+    names = [parameter.name for parameter in PARAMETERS if widths.get(parameter.name, 0.0) > 0]
     names = [name for name in names if name != "delay"]
     formation, segments = curve.formation, curve.segments
-    share = (1 - np.cos(np.linspace(0.0, np.pi, _LOOKS))) / 2
-    s = np.concatenate([part.start + share * (part.stop - part.start) for part in segments])
-    segment = np.repeat(np.arange(len(segments)), _LOOKS)
+    fraction = (1 - np.cos(np.linspace(0.0, np.pi, _PLACES))) / 2
+    s = np.concatenate([part.start + fraction * (part.stop - part.start) for part in segments])
+    segment = np.repeat(np.arange(len(segments)), _PLACES)
     point = curve.evaluate(s)
     directions = directions_of(curve, segment)
     forces = inverse(formation, point, directions)
     limits = make_limits(formation, epsilon).split(2)[0]
     rows = limits.only(PRESS, CONE).rows[:, :-4]
-    none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
+    zero = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
     radii = np.array([widths[name] for name in names])
-    bare = RobustLimits(tuple(names), radii, rows, s, segment, none)
-    variations = bare.find_variations(formation, point, directions, forces, epsilon)
-    a, b, lam = (np.interp(s, guide.s, column) for column in guide[1:])
-    signs = _find_signs(bare, limits, forces, variations, point.z_s[:, 3:], (a, b, lam))
-    return bare._replace(signs=signs)
+    unsigned = RobustLimits(tuple(names), radii, rows, s, segment, zero)
+    variations = unsigned.find_variations(formation, point, directions, forces, epsilon)
+    a, b, lam = (np.interp(s, reference.s, column) for column in reference[1:])
+    signs = _find_signs(unsigned, limits, forces, variations, point.z_s[:, 3:], (a, b, lam))
+    return unsigned._replace(signs=signs)
 
 
 def _find_signs(
-    bare: RobustLimits,
+    unsigned: RobustLimits,
     limits: LimitSet,
     forces: PathForces,
     variations: Array,
     rates: Array,
     motion: tuple[Array, Array, Array],
 ) -> NDArray[np.int8]:
-    """Signs of the rows that meet at the vertices of largest and least a."""
-    wider, signs, b = spread_limits(limits), bare.signs.copy(), motion[1].copy()
+    """Signs of the rows that meet at the vertices of largest and least a, by cutting planes."""
+    repeated, signs, b = repeat_limits(limits), unsigned.signs.copy(), motion[1].copy()
     signs[:, :, 4] = np.sign(measure(variations, motion))
-    forced = limits.only(PRESS, CONE)
-    for turn in range(8):  # cutting planes
-        extended = forces._replace(of_c=bare.extend(forces.of_c, variations, signs))
-        sides = PathLimits.of(wider, extended, rates)
-        rows = sides.eliminate()
+    limits = limits.only(PRESS, CONE)
+    for iteration in range(8):  # cutting planes
+        extended = forces._replace(of_c=unsigned.extend(forces.of_c, variations, signs))
+        path_limits = PathLimits.of(repeated, extended, rates)
+        rows = path_limits.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
-        ends = [sides.meet(b, sides.pair(row)) for row in extremes]
+        ends = [path_limits.meet(b, path_limits.pair(row)) for row in extremes]
         with np.errstate(invalid="ignore"):
-            b = np.where(ends[0][0] < ends[1][0], 0.5 * b, b)  # no polygon there
+            b = np.where(ends[0][0] < ends[1][0], 0.5 * b, b)  # the polygon is empty
         for end, (a, lam) in enumerate(ends):
-            here = np.nan_to_num(a), b, np.nan_to_num(lam)
-            slack = bare.evaluate(forces, variations, here) - forced.low
-            rowed = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
-            missed = slack < rowed.min(axis=2) - forced.low - 1e-9 * forced.scales  # rounding
-            better = np.sign(measure(variations, here)).astype(np.int8)
-            slots = (2 * end, 2 * end + 1) if turn == 0 else (2 * end + turn % 2,)
+            vertex = np.nan_to_num(a), b, np.nan_to_num(lam)
+            slack = unsigned.evaluate(forces, variations, vertex) - limits.low
+            modelled = extended.c(*vertex)[:, unsigned.rows.shape[1] :].reshape(*slack.shape, -1)
+            violated = slack < modelled.min(axis=2) - limits.low - 1e-9 * limits.scales  # rounding
+            vertex_signs = np.sign(measure(variations, vertex)).astype(np.int8)
+            slots = (2 * end, 2 * end + 1) if iteration == 0 else (2 * end + iteration % 2,)
             for slot in slots:
-                signs[:, :, slot] = np.where(missed[..., None], better, signs[:, :, slot])
+                signs[:, :, slot] = np.where(violated[..., None], vertex_signs, signs[:, :, slot])
     return signs
 
 
 RobustHold = tuple[TorquePolygon, Array]
-"""Torques that friction can hold at rest: times gains, shape (2,), within a polygon."""
+"""Torques that friction can hold at rest: within a polygon after multiplication by gains, (2,)."""
 
 
 def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> list[RobustHold]:
     """Torques that friction can hold at `z`, with the largest friction, at corners of the ranges.
 
-    Polygons are proportional to the mass: torques beyond the same side for its least and largest
-    value are beyond it for all in between.
+    Polygons are proportional to the mass: torques beyond the same side for the least and largest
+    mass are beyond it for all masses between.
     """
     fingers = (ranges.get("gain1", 0.0), ranges.get("gain2", 0.0))
-    gains = list(product(*(_spread(width) for width in fingers)))
+    gains = list(product(*(_bounds(width) for width in fingers)))
     largest, holds = {key: ranges[key] for key in ranges if key.startswith("friction")}, []
-    for mass in _spread(ranges.get("mass", 0.0)):
+    for mass in _bounds(ranges.get("mass", 0.0)):
         scene = change_scene(formation.scene, largest | {"mass": mass - 1})
-        corner = replace(formation, scene=scene)
-        static = Statics(corner, z).torque_polygon()
+        static = Statics(replace(formation, scene=scene), z).torque_polygon()
         holds += [(static, np.array(gain)) for gain in gains]
     return holds
 
 
 def measure_holds(holds: Sequence[RobustHold], tau: Array) -> float:
-    """Distance of torques, (2,), beyond those that friction can hold in any corner [N m]."""
+    """Least distance of torques, (2,), from those that friction can hold in a corner [N m]."""
     return min(float(static.measure((gains * tau)[None])[0]) for static, gains in holds)
 
 
-def _spread(width: float) -> tuple[float, ...]:
+def _bounds(width: float) -> tuple[float, ...]:
     return (1 - width, 1 + width) if width else (1.0,)
