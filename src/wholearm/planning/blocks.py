@@ -237,8 +237,8 @@ def _plan_over_time(
 ) -> Plans:
     """Plans of a block in the time domain, from those with free torques if motors limit these.
 
-    Under rate limits in the first modes with free torques, then in those of the mode search: phases
-    5 and 6 of the heptagon have a plan from the former alone, phase 15 of query 28 from the latter.
+    Under rate limits first in the modes of a coarse plan with free torques, then in searched modes:
+    phases 5 and 6 of the heptagon need the former, phase 15 of query 28 the latter.
     """
     from .time_domain.time_plan import plan_with_impacts
 
@@ -248,8 +248,8 @@ def _plan_over_time(
     coarse, initial_plans = arguments.get("coarse", False), arguments.pop("initial_plans", ())
     free_guess, guess = (initial_plans, ()) if limited and coarse else ((), initial_plans)
     for complete in (False, True) if limited and options.mode_search else (options.mode_search,):
-        first = replace(planning, options=replace(options, mode_search=complete))
-        free_plans = plan_free(first, block, z, initial_plans=free_guess, **arguments)
+        variant = replace(planning, options=replace(options, mode_search=complete))
+        free_plans = plan_free(variant, block, z, initial_plans=free_guess, **arguments)
         guesses: Any = {"free_plans": free_plans, "initial_plans": guess}
         plan: Callable[[float | None], Plans] = partial(
             plan_with_impacts, problem, block, z, options, **guesses, **arguments
@@ -484,7 +484,7 @@ class ImpactSequence:
 def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
     """Plan the parts of a block along curves under rate limits, with pauses between them.
 
-    Torques change in pauses from those of the block before, and to those of the next one.
+    Torques also change in pauses from those of the previous block, and to those of the next one.
     """
     from .dwell import Junction, add_pause, choose_junction
 

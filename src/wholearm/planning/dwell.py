@@ -198,7 +198,7 @@ def find_ends(
 
 
 def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> Plans:
-    """The plans with dwells; rate-limited torques change to those of the dwell and back."""
+    """The plans with dwells; rate-limited torques change continuously to the dwell and back."""
     held: Plans = []
     tau: Array | None = None
     for phase, plan, end in zip(problem.phases, plans, ends, strict=True):
@@ -251,7 +251,7 @@ ALLOCATIONS = (
     (0.0, 0.0, True),  # heptagon at 5 %
     (0.0, 0.0, False),  # heptagon_twice at 5 %
 )
-STOP = 0.06  # relative dwell time of an end that gains no contact
+STOP_WEIGHT = 0.06  # relative dwell time of an end that gains no contact
 
 
 def share_time(
@@ -270,11 +270,11 @@ def share_time(
             if place is None or times[k] is not None:
                 continue
             has_gap = find_opening(place) is not None
-            weights[k] = (1.0 if gained else first) if has_gap else STOP
+            weights[k] = (1.0 if gained else first) if has_gap else STOP_WEIGHT
             gained += has_gap
         if gained > 1:
             weights[-1] *= last
-        durations = total * weights / max(float(weights.sum()), STOP**2)
+        durations = total * weights / max(float(weights.sum()), STOP_WEIGHT**2)
         pairs = zip(durations.tolist(), times, strict=True)
         dwell_times = [duration if time is None else time for duration, time in pairs]
         ends = find_ends(problem, places, dwell_times, max_margin)

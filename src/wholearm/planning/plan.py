@@ -204,8 +204,8 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             # Planning with control periods starts from a plan with a stop, which does not exist.
             if impact.possible and not planning.problem.scene.control_period:
                 report(f"phase {impact.phase}: what its impact saves")
-                at = impact.phase - first
-                bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
+                end = impact.phase - first
+                bounds = max(k for k in stops if k < end), end, min(k for k in stops if k > end)
                 with charge(impact.phase):
                     impact = impact._replace(saves=_find_saving(planning, block, bounds, planner))
             transitions.append(impact)
@@ -213,10 +213,10 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
 
 
 def _plan_part(
-    chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *others: Any
+    chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *options: Any
 ) -> Plans:
     """Plan phases `start` to `stop` of a chain, from rest at its start: a `PlanPart`."""
-    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *others), explained=False)]
+    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *options), explained=False)]
 
 
 def _find_saving(

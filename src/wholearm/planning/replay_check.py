@@ -27,7 +27,7 @@ from .blocks import BlockPlan, Planning, plan_each
 from .phase_plan import combine
 
 INCREASE = 2.0  # increase of epsilon over a small shortfall of c_n
-_ARRIVAL = 1e-2  # largest error of an arrival over the duration of its phase
+_ARRIVAL_ERROR = 1e-2  # largest error of an arrival over the duration of its phase
 RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
 _DIVISOR = 8.0  # of the error of the rows of a table if its replay does not hold
 _ATTEMPTS = 3  # most tables
@@ -80,9 +80,9 @@ class ReplayCheck(NamedTuple):
             departs = deviation > allowance.departure
             speed = phase.end_speed or 0.0
             displacement = speed * following.get(phase.number, 0.0)
-            fast = speed > allowance.rest_speed * scales.speed
-            late = abs(arrival - ends[k]) > _ARRIVAL * durations[k]
-            if departs or fast or late or displacement > allowance.departure * scales.length:
+            moving = speed > allowance.rest_speed * scales.speed
+            late = abs(arrival - ends[k]) > _ARRIVAL_ERROR * durations[k]
+            if departs or moving or late or displacement > allowance.departure * scales.length:
                 return min(phase.number, self.failure[0])
         return self.failure[0]
 
@@ -205,8 +205,8 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     t, phases, *samples = (
         getattr(trajectory, name)[moving] for name in ("t", "phase", *Samples._fields)
     )
-    torques = trajectory.contacts, trajectory.torque
-    motions = sample_phases(t, phases, Samples(*samples), *torques)
+    names, torque = trajectory.contacts, trajectory.torque
+    motions = sample_phases(t, phases, Samples(*samples), names, torque)
     for phase, motion in zip(problem.phases, motions, strict=True):
         formation = phase.formation
         contacts = {contact.name: contact for contact in formation.contacts}

@@ -318,10 +318,10 @@ def _list_settlings(plan: Plan) -> Iterator[str | Table]:
     yield Table(heads, rows)
     yield from (f"warning: {dwell.warning}" for dwell in dwells if dwell.warning)
     held, share = (sum(getattr(dwell, key) for dwell in dwells) for key in ("duration", "share"))
-    text, whole = f"held for {held:.6g} s in all", held / share if share else plan.duration - held
-    more = plan.duration - held - whole
-    changes = f"; torques change into and out of that for {more:.6g} s more"
-    yield f"{text}, {share:.1%} of the motion's {whole:.6f} s{changes * (more > 1e-9 * whole)}"
+    text, time = f"held for {held:.6g} s in all", held / share if share else plan.duration - held
+    extra = plan.duration - held - time
+    changes = f"; torque changes before and after dwells take {extra:.6g} s more"
+    yield f"{text}, {share:.1%} of the motion's {time:.6f} s{changes * (extra > 1e-9 * time)}"
 
 
 def _describe_held(plan: Plan) -> Iterator[str]:

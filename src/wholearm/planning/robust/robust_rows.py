@@ -85,7 +85,7 @@ class RobustLimits(NamedTuple):
     ) -> Array:
         """The left sides of the robust limits, shape (n, m) [N]."""
         nominal = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
-        return np.asarray(nominal - np.abs(measure(variations, motion)).sum(axis=2))
+        return np.asarray(nominal - np.abs(find_parametric_bounds(variations, motion)).sum(axis=2))
 
 
 def find_variations(
@@ -114,7 +114,7 @@ def find_variations(
     return np.asarray(variations)
 
 
-def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
+def find_parametric_bounds(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
     """Parametric bounds of a motion, shape (n, m, p) [N]."""
     return np.asarray(np.einsum("nmpq,nq->nmp", variations, stack_motion(*motion)))
 
@@ -172,7 +172,7 @@ def _find_signs(
 ) -> NDArray[np.int8]:
     """Signs of the rows that meet at the vertices of largest and least a, by cutting planes."""
     repeated, signs, b = repeat_limits(limits), unsigned.signs.copy(), motion[1].copy()
-    signs[:, :, 4] = np.sign(measure(variations, motion))
+    signs[:, :, 4] = np.sign(find_parametric_bounds(variations, motion))
     limits = limits.only(PRESS, CONE)
     for iteration in range(8):  # cutting planes
         extended = forces._replace(of_c=unsigned.extend(forces.of_c, variations, signs))
@@ -187,7 +187,7 @@ def _find_signs(
             slack = unsigned.evaluate(forces, variations, vertex) - limits.low
             modelled = extended.c(*vertex)[:, unsigned.rows.shape[1] :].reshape(*slack.shape, -1)
             violated = slack < modelled.min(axis=2) - limits.low - 1e-9 * limits.scales  # rounding
-            vertex_signs = np.sign(measure(variations, vertex)).astype(np.int8)
+            vertex_signs = np.sign(find_parametric_bounds(variations, vertex)).astype(np.int8)
             slots = (2 * end, 2 * end + 1) if iteration == 0 else (2 * end + iteration % 2,)
             for slot in slots:
                 signs[:, :, slot] = np.where(violated[..., None], vertex_signs, signs[:, :, slot])

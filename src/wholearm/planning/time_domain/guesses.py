@@ -77,8 +77,9 @@ class Guess(NamedTuple):
     def end_at(self, z: Array, problem: Problem) -> Guess:
         """Copy with a prescribed end `z`, shape (5,).
 
-        Prescribed are coordinates that determine z well, those of the object first. Rolling does
-        not count: the largest margin of `hexagon.toml` may end in a mode without freedoms.
+        As many coordinates are prescribed as determine z well, those of the object first. Rolling
+        contacts do not reduce their number: the largest margin of `hexagon.toml` may end in a mode
+        without freedoms.
         """
         N = tangent_basis(problem.phases[self.stages[-1].phase].formation, z)
         choices = [list(rows) for rows in combinations((0, 2, 1, 3, 4), N.shape[1])]
@@ -102,7 +103,7 @@ class Guess(NamedTuple):
 
     def by_homotopy(self) -> Guess:
         """Copy to be solved in the modes of the friction homotopy."""
-        name = f"{self.name} with friction that sets in gradually"
+        name = f"{self.name}, by friction homotopy"
         return self._replace(name=name, homotopy=True)
 
 
@@ -408,12 +409,12 @@ def find_margin(path: PathGuess, epsilon: float, with_profile: bool = False) -> 
     motion = np.stack([np.diff(nodes, axis=0) / (2 * steps), (nodes[1:] + nodes[:-1]) / 2], axis=1)
     rows = -(slack[..., [A, B]] @ motion)
     rows[..., -1] = 1.0
-    inequalities = rows.reshape(-1, size), slack[..., ONE].ravel()
+    A_ub, b_ub = rows.reshape(-1, size), slack[..., ONE].ravel()
     speed_bounds = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0)]  # the largest b
 
     def maximise(objective: Array, least: float | None) -> Any:
         bounds = [*speed_bounds, (least, 1.0)]
-        return linprog(-objective, *inequalities, bounds=bounds, method="highs")
+        return linprog(-objective, A_ub, b_ub, bounds=bounds, method="highs")
 
     solution = maximise(np.eye(size)[-1], None)
     if solution.status != 0:
@@ -426,8 +427,8 @@ def find_margin(path: PathGuess, epsilon: float, with_profile: bool = False) -> 
     fastest = maximise(speeds, least) if with_profile else None
     if fastest is not None and fastest.status == 0:
         v = scene.scales.speed * np.sqrt(np.maximum(fastest.x[: m + 1], 0.0))
-        slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
-        t = np.append(0.0, np.cumsum(2 * steps[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
+        floor = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
+        t = np.append(0.0, np.cumsum(2 * steps[:, 0] / np.maximum(v[1:] + v[:-1], floor)))
         length = np.append(0.0, np.cumsum(steps))
         c_motion = np.einsum("nci,ni->nc", forces.of_c[..., [A, B]], motion @ fastest.x)
         c = forces.of_c[..., ONE] + c_motion
@@ -499,7 +500,7 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
     assert solution is not None
     pieces = [split_by_signs(stage, search.scheme) for stage in stages]
     if not all(pieces):
-        status = "with friction that sets in gradually things turn too often"
+        status = "the friction homotopy has too many reversals"
         return solution._replace(status=status, success=False)
     exact = [replace(piece, smoothing=0.0) for parts in pieces for piece in parts]
     return solution._replace(stages=link(merge(exact)))
@@ -562,18 +563,18 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
             runs = [run for n, run in enumerate(runs) if not n or run[1] != runs[n - 1][1]]
         first[row] = runs[0][1]
         reversals += [(place, row, sign) for place, sign in runs[1:]]
-    changes, near = list[_Change](), 2 * float(np.diff(places).max())
+    changes, tolerance = list[_Change](), 2 * float(np.diff(places).max())
     for place, row, sign in sorted(reversals):
         previous, rows = changes[-1] if changes else (-1.0, {})
         tied = find_tied(formation, z[int(np.abs(places - place).argmin())], row)
-        if place - previous < near and row not in rows and set(rows) & set(tied):
+        if place - previous < tolerance and row not in rows and set(rows) & set(tied):
             rows[row] = sign
         else:
             changes.append((place, {row: sign}))
     # Where all rates reverse at about the same time the motion stops: one change (goal 53).
     merged, count = list[_Change](), int(np.count_nonzero(first))
     while changes:
-        simultaneous = [change for change in changes if change[0] < changes[0][0] + near]
+        simultaneous = [change for change in changes if change[0] < changes[0][0] + tolerance]
         rows = {row: sign for _, group in simultaneous for row, sign in group.items()}
         if len(rows) == sum(len(group) for _, group in simultaneous) == count:
             merged.append((simultaneous[len(simultaneous) // 2][0], rows))
@@ -635,8 +636,7 @@ def guess_stages(
         opens = k > 0 and previous is not phase
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(path.z[:1])[0]) < 1e-5  # closed
-            contacts = previous.formation.contacts, phase.formation.contacts
-            renamed = list_renamed(scene, *contacts)
+            renamed = list_renamed(scene, previous.formation.contacts, phase.formation.contacts)
             closed, limits = np.flatnonzero(touching).tolist(), phase.formation.limits
             released = tuple(row for row in closed if limits[row].gained not in renamed)
         stages.append(

@@ -252,8 +252,8 @@ def release_earlier(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
         if set(remaining) < set(names) and not following.formation.rolling:
             rows, (Xi, sigma) = [names.index(name) for name in remaining], stage.directions
             guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
-            moved = replace(following, directions=Directions(Xi[rows], sigma), guess=guess)
-            yield link(merge([*stages[:k], moved, *stages[k + 1 :]]))
+            released = replace(following, directions=Directions(Xi[rows], sigma), guess=guess)
+            yield link(merge([*stages[:k], released, *stages[k + 1 :]]))
 
 
 def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
@@ -361,12 +361,12 @@ def list_neighbours(
 
     def change_each(runs: list[tuple[int, ModeRun]]) -> list[list[Stage]]:
         """Changes of whole stages that are mostly one run, then of single runs."""
-        whole = [
+        extended = [
             (k, run._replace(begin=0, stop=stages[k].intervals))
             for k, run in runs
             if 2 * run.duration > stages[k].guess.duration
         ]
-        groups = (sorted(group, key=lambda pair: -pair[1].duration) for group in (whole, runs))
+        groups = (sorted(group, key=lambda pair: -pair[1].duration) for group in (extended, runs))
         return [neighbour for group in groups for pair in group if (neighbour := change(*pair))]
 
     if at_cones:

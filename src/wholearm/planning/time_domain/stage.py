@@ -121,7 +121,7 @@ class Stage:
     phase: int  # index of its phase
     formation: Formation
     directions: Directions
-    guess: StagePoints  # initial guess; its intervals are those of the NLP
+    guess: StagePoints  # initial guess, on the intervals of the NLP
     goal: Until | None = None  # end of its phase; None for a release
     impact: bool = False  # whether its phase ends in an impact, before another phase
     until: Until | None = None  # end of the stage; None if it ends by a reversal or a release
@@ -183,8 +183,8 @@ class Stage:
         The clearance counts from the fraction `after` of the stage on; for contacts released before
         the stage it counts throughout. With continuous torques gaps open with the cube of time.
         """
-        slow = self.formation.scene.has_slow_motors
-        late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
+        continuous = self.formation.scene.has_slow_motors
+        late = (np.minimum(places / after, 1.0) ** 3 if continuous else places > after)[:, None]
         released, clear = (np.isin(self.monitored, k) for k in (self.released, self.clear_at_end))
         opened = np.where(self.opens, late, 1.0)
         return np.asarray(self.clearance * np.maximum(released * opened, clear * late))

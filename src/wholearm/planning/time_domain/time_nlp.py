@@ -58,7 +58,7 @@ SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, a
 
 @dataclass(frozen=True, eq=False)
 class StageLayout:
-    """Indices of one stage's unknowns; those of `StagePoints` have the shapes there."""
+    """Indices of one stage's unknowns; fields of `StagePoints` have the shapes given there."""
 
     h: Indices
     nodes: Indices
@@ -217,7 +217,7 @@ def build_time_nlp(
             rows.add_copies(kernel, columns, cost=True)
         elif controls > 2:
             weights = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # avoids ringing
-            rows.add_copies(bend_kernel(controls), columns, weights, cost=True)
+            rows.add_copies(curvature_kernel(controls), columns, weights, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
         cost[layout.shortfalls] = 1 / stage.intervals
     duration_row, last_stage, (end_z, end_v) = -1, stages[-1], layouts[-1].nodes[-1]
@@ -783,9 +783,9 @@ def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
     ends = [k for k in gaining if k < count]
     if len(gaining) == len(ends) == 1:
         return ends[0]
-    near = 1e-3 * formation.scene.scales.length
+    tolerance = 1e-3 * formation.scene.scales.length
     values = formation.evaluate_limits(z[None])[0] if ends else ()
-    return next((k for k in ends if values[k] < near), None)
+    return next((k for k in ends if values[k] < tolerance), None)
 
 
 @share
@@ -845,12 +845,12 @@ def effort_kernel(controls: int) -> Kernel:
 
 
 @share
-def bend_kernel(controls: int) -> Kernel:
+def curvature_kernel(controls: int) -> Kernel:
     """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)
-    bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
-    return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
+    differences = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
+    return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(differences**2)))
 
 
 def find_released(formation: Formation, following: Formation) -> list[int]:

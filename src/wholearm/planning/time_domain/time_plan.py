@@ -242,8 +242,8 @@ def meet_motor_limits(search: TimeSearch, free_stages: Sequence[Stage]) -> TimeS
         factor = math.inf
     scene = search.source.scene
     relaxed_scene = scene.quicken(factor) if math.isfinite(factor) else None
-    most = f"motors {max(factors):g} times as quick"
-    raise refuse_motors(scene, relaxed_scene, search.numbers, attempt=most)
+    attempt = f"motors {max(factors):g} times as quick"
+    raise refuse_motors(scene, relaxed_scene, search.numbers, attempt=attempt)
 
 
 def try_phases(
@@ -454,9 +454,9 @@ def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
     """
     remaining, changed = list(stages), False
     for k, (stage, next_stage) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
-        last = next_stage is None or next_stage.phase != stage.phase
+        is_last = next_stage is None or next_stage.phase != stage.phase
         part, count = stage.guess, stage.periods.index(stage.periods[-1])
-        if last and count and part.h[count:].sum() < _TINY * stage.period:
+        if is_last and count and part.h[count:].sum() < _TINY * stage.period:
             # The last remaining interval takes the end state of the stage.
             names = ("h", "z", "v", "a", "forces", "tau")
             tables = {name: getattr(part, name)[:count] for name in names}
