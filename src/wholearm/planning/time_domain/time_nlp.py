@@ -162,7 +162,7 @@ class LimitPart(NamedTuple):
 class StageRows:
     """Rows of one stage, interval by interval."""
 
-    states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
+    states: Indices  # (K, 2, n, f): collocation of z and z', n rows of the scheme along `bases`
     bases: Array  # (K, 5, f): tangent space of each interval
     balance: Indices  # (K, d, 5): equations of motion at the points
     slip_rates: Indices  # (K, d, n_rubbing): sliding directions of contacts with friction
