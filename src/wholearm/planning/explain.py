@@ -246,7 +246,7 @@ def _change_task(task: Task, parameter: Parameter, value: float) -> Task:
 
 
 def _find_least(task: Task, parameter: Parameter) -> float | None:
-    """The least change of a parameter with which a speed sweep finds a motion, to 0.3 %.
+    """Value of a parameter nearest to its own with which a speed sweep finds a motion, to 0.3 %.
 
     By bisection, up to a thousand times its value or down to zero; None if there is none.
     """
@@ -495,8 +495,8 @@ def explain_stages(
         if violations:
             worst = max(violations, key=attrgetter("share"))
             text += f"; where it stopped, {worst}"
-        default = search.options.transcription == "time" and not problem.scene.control_period
-        if default and runs_along_curves(phases, PlanOptions()):
+        over_time = search.options.transcription == "time" and not problem.scene.control_period
+        if over_time and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 

@@ -110,10 +110,10 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
     if problem.scene.control_period:
         options = replace(options, transcription="time")
     with open_ledger() as ledger:
-        started = time.perf_counter()
+        t_start = time.perf_counter()
         report("tracing the phases")
         curves = trace_phases(problem)
-        traced = time.perf_counter()
+        t_trace = time.perf_counter()
         try:
             planning = plan_blocks(problem, curves, options, report)
         except InfeasibleError as error:
@@ -123,17 +123,17 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
                 error.motion = replace(error.motion, meta=error.motion.meta | meta)
             raise
         margins = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
-        planned, figures = time.perf_counter(), None
+        t_plan, figures = time.perf_counter(), None
         if options.replay:
             from .replay_check import replay_plan
 
-            first = planning
+            initial = planning
             planning, figures = replay_plan(planning, report)
-            if planning is not first:
+            if planning is not initial:
                 margins = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
-        replayed = time.perf_counter()
+        t_replay = time.perf_counter()
         transitions = _assess(planning, report)
-        assessed = time.perf_counter()
+        t_assess = time.perf_counter()
         ranges = assess_ranges(planning, report) if options.robust else None
         certificate = certify(planning, report) if options.certify else None
         gaps = certificate.gaps if certificate else {}
@@ -165,12 +165,12 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             tuple(transitions),
             figures,
             Timings(
-                traced - started,
+                t_trace - t_start,
                 sum(phase.statistics.build_time for phase in phases),
                 sum(phase.statistics.solve_time for phase in phases),
-                planned - started,
-                replayed - planned,
-                assessed - replayed,
+                t_plan - t_start,
+                t_replay - t_plan,
+                t_assess - t_replay,
             ),
             {
                 "wholearm": __version__,
@@ -213,10 +213,10 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
 
 
 def _plan_part(
-    chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *options: Any
+    chain: ImpactSequence, epsilon: float, start: int, stop: int, z: Array, *arguments: Any
 ) -> Plans:
     """Plan phases `start` to `stop` of a chain, from rest at its start: a `PlanPart`."""
-    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *options), explained=False)]
+    return [*plan_curves(chain.part(start, stop).make_task(epsilon, *arguments), explained=False)]
 
 
 def _find_saving(

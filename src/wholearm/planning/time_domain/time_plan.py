@@ -261,7 +261,7 @@ def try_phases(
     Parameters
     ----------
     goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
-    all_guesses   whether guesses after the homotopy are tried
+    all_guesses   whether the friction homotopy and the guesses after it are tried
     single_guess  whether to solve from one guess alone
     stop_plans    plans of the phases, each from rest to rest, as the only guess
     """
@@ -279,7 +279,7 @@ def try_phases(
         if not all_guesses:
             candidates = takewhile(lambda guess: not guess.homotopy, candidates)
         candidates = chain(candidates, _free_ends(search, guesses))
-    # Many edges have no plan. From one with a stop query 10 takes 23 to 53 iterations, by rounding.
+    # Many edges have no plan. From a plan with a stop query 10 takes 23 to 53 iterations.
     solution = solve_guesses(search, candidates, max_iter=60 if stop_plans else 35)
     if solution is None:
         return None
