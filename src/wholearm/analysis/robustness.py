@@ -33,7 +33,14 @@ from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation.events import OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free
-from ..verification.free import MOMENT, REACHED, TURNED, find_touch, list_aliases, list_gained
+from ..verification.free import (
+    CLOSING_TIME,
+    END_ANGLE,
+    END_DISTANCE,
+    find_touch,
+    list_aliases,
+    list_gained,
+)
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
@@ -64,10 +71,10 @@ class Uncertainty:
     sample_rate: float | None = 1000.0
     # of the simulations of samples, relative to the scene: far below what counts as the goal
     tolerance: float = 1e-6
-    # [m]: how far from the planned place a goal counts as reached; `REACHED` of the scene's length
+    # [m]: largest distance from the planned place at a goal; `END_DISTANCE` of the scene's length
     # if left out
     distance: float | None = None
-    angle: float = TURNED  # [rad]: how far from the planned angle
+    angle: float = END_ANGLE  # [rad]: how far from the planned angle
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", read_widths(self.widths, "range of {}"))
@@ -79,7 +86,7 @@ class Uncertainty:
 
     def find_distance(self, scene: Scene) -> float:
         """How far from the planned place a goal counts as reached [m]."""
-        return REACHED * scene.scales.length if self.distance is None else self.distance
+        return END_DISTANCE * scene.scales.length if self.distance is None else self.distance
 
     @property
     def varied(self) -> tuple[Field, ...]:
@@ -184,7 +191,7 @@ class Trial:
             return self.judge(simulation, 0.0, [stop + late for stop in self.stops])
         # A phase begins when its first torques take effect; the last one goes on to the end.
         end = float(simulation.t[-1])
-        began = {number: time + what.delay for number, time in what.began.items()}
+        began = {number: time + what.delay for number, time in what.phase_starts.items()}
         began[self.phases[-1].number + 1] = end
         stops = [began.get(phase.number + 1, math.inf) for phase in self.phases]
         return self.judge(simulation, began.get(self.phases[0].number, end), stops)
@@ -214,7 +221,7 @@ class Trial:
 
         A phase goes on from when the last one's contact was gained to when its own is, or to its
         end by the clock. A contact is lost that opens for longer than 1e-3 units of time. One that
-        is open at the start, which may be off, has `MOMENT` to close for good.
+        is open at the start, which may be off, has `CLOSING_TIME` to close for good.
         """
         unit, t = self.problem.scene.scales.time, simulation.t
         losses, least = list[tuple[float, int, str]](), math.inf
@@ -227,7 +234,7 @@ class Trial:
                 c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))
                 pauses = simulation.list_pauses(name, began, stop, aliases[name])
-                closed = began + MOMENT * unit if pauses and pauses[0][0] <= began else began
+                closed = began + CLOSING_TIME * unit if pauses and pauses[0][0] <= began else began
                 long = [pause for pause in pauses if pause[1] - pause[0] > 1e-3 * unit]
                 losses += [(first, phase.number, name) for first, after in long if after > closed]
             began = max(planned, gain) if gained else planned

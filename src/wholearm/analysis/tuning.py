@@ -704,9 +704,11 @@ class PassageTuner:
         for event in events:
             phase, lost = self.passage.phases[len(ends)], event.kind is EventKind.CONTACT_LOST
             if phase.until.contact is not None:
-                is_end = event.kind in free.TOUCHES and event.contact == phase.until.contact.name
+                is_end = (
+                    event.kind in free.TOUCH_EVENTS and event.contact == phase.until.contact.name
+                )
             else:
-                leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else ()
+                leaving = free.list_released(self.problem, phase) if phase.until.is_release else ()
                 is_end = lost and event.contact in leaving
             if is_end:
                 ends.append(event.time)
@@ -773,7 +775,7 @@ class PassageTuner:
         c_n = np.nan_to_num(forces[:, [contacts.index(name) for name in names]], nan=math.inf)
         for index, phase in enumerate(phases):
             # Contacts that the phase releases at its end do not count.
-            leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else set()
+            leaving = free.list_released(self.problem, phase) if phase.until.is_release else set()
             others = [name in leaving or name not in phase.formation.names for name in names]
             c_n[np.ix_(of == index, others)] = math.inf
         row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)

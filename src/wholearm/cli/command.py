@@ -886,7 +886,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _policy(options: argparse.Namespace) -> int:
     from ..planning.plan import plan_anew
-    from ..policy.make import find_widest
+    from ..policy.make import find_largest_factors
     from ..problem.read import read_own_problem
     from ..verification.free import CONTACT_SPEEDS, find_policy
 
@@ -925,7 +925,7 @@ def _policy(options: argparse.Namespace) -> int:
         made, report = find_policy(problem, plan, **values)
         if options.largest:
             show_progress("looking for the widest ranges")
-            each = find_widest(problem, plan, options.delay)
+            each = find_largest_factors(problem, plan, options.delay)
             made.about["largest"] = {str(number): factor for number, factor in each.items()}
     failures = "; ".join(report.failures)
     if not report.ok and options.write_anyway:

@@ -764,7 +764,7 @@ def _judge(
     goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
     away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
     position, angle = float(np.hypot(*away[:2])), float(away[2])
-    begins = [loop.began.get(index + 1, np.inf) for index in stretch.phases]
+    begins = [loop.phase_starts.get(index + 1, np.inf) for index in stretch.phases]
     contact, gap = "", 0.0
     for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
         phase = problem.phases[index]
