@@ -31,7 +31,7 @@ from ..common.files import require_ending, write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
 from ..problem.read import read_own_problem
-from ..results.adopt import Torques, narrow
+from ..results.adopt import Torques, split_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
@@ -460,7 +460,7 @@ def force_margins(
     InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
     range.
     """
-    _, trajectory = narrow(what)
+    _, trajectory = split_torques(what)
     if trajectory is None:
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
     width = style.WIDTHS.read(width, "width")

@@ -24,7 +24,13 @@ from ..geometry.tracing import EndDistance
 from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import End, Phase, Problem
-from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
+from ..results.adopt import (
+    HasTrajectory,
+    Torques,
+    adopt_motion,
+    adopt_torques,
+    require_same_contacts,
+)
 from ..results.report import DEPARTURE, Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
@@ -105,7 +111,7 @@ def verify_free(
 @exclusive
 def verify_policy(
     problem: Problem,
-    plan: Trajectory | Moved,
+    plan: Trajectory | HasTrajectory,
     policy: Policy,
     *,
     tolerance: float = 1e-9,
@@ -168,7 +174,7 @@ def verify_policy(
 
 def find_policy(
     problem: Problem,
-    plan: Trajectory | Moved,
+    plan: Trajectory | HasTrajectory,
     *,
     contact_speed: float | None = None,
     departure: float = DEPARTURE,
