@@ -33,14 +33,7 @@ from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation.events import OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free
-from ..verification.free import (
-    CLOSING_TIME,
-    END_ANGLE,
-    END_DISTANCE,
-    find_touch,
-    list_aliases,
-    list_gained,
-)
+from ..verification.free import END_ANGLE, END_SHIFT, GRACE, find_touch, list_aliases, list_gained
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
@@ -69,7 +62,7 @@ class Uncertainty:
     sample_rate: float | None = 1000.0
     # of the simulations of samples, relative to the scene: far below the tolerances of the goal
     tolerance: float = 1e-6
-    # [m]: largest distance from the planned place at a goal; `END_DISTANCE` of the scene's length
+    # [m]: largest distance from the planned place at a goal; `END_SHIFT` of the scene's length
     # if left out
     distance: float | None = None
     angle: float = END_ANGLE  # [rad]: largest difference from the planned angle at a goal
@@ -84,7 +77,7 @@ class Uncertainty:
 
     def find_distance(self, scene: Scene) -> float:
         """Largest distance from the planned place at a goal [m]."""
-        return END_DISTANCE * scene.scales.length if self.distance is None else self.distance
+        return END_SHIFT * scene.scales.length if self.distance is None else self.distance
 
     @property
     def varied(self) -> tuple[Field, ...]:
@@ -219,7 +212,7 @@ class Trial:
 
         A phase lasts from the gain of the contact of the one before to the gain of its own, or to
         its planned end. A contact is lost if it opens for longer than 1e-3 units of time. One that
-        is open at the start, which may be inexact, has `CLOSING_TIME` to close. Returns as `run`.
+        is open at the start, which may be inexact, has `GRACE` to close. Returns as `run`.
         """
         unit, t = self.problem.scene.scales.time, simulation.t
         losses, least = list[tuple[float, int, str]](), math.inf
@@ -232,7 +225,7 @@ class Trial:
                 c_n = simulation.c_n[(t >= start) & (t < stop), simulation.contacts.index(name)]
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))
                 pauses = simulation.list_pauses(name, start, stop, aliases[name])
-                settled = start + CLOSING_TIME * unit if pauses and pauses[0][0] <= start else start
+                settled = start + GRACE * unit if pauses and pauses[0][0] <= start else start
                 long = [pause for pause in pauses if pause[1] - pause[0] > 1e-3 * unit]
                 losses += [(opened, phase.number, name) for opened, end in long if end > settled]
             start = max(planned, gain_time) if gained else planned

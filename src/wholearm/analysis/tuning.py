@@ -704,9 +704,7 @@ class PassageTuner:
         for event in events:
             phase, lost = self.passage.phases[len(ends)], event.kind is EventKind.CONTACT_LOST
             if phase.until.contact is not None:
-                is_end = (
-                    event.kind in free.TOUCH_EVENTS and event.contact == phase.until.contact.name
-                )
+                is_end = event.kind in free.TOUCHES and event.contact == phase.until.contact.name
             else:
                 released = free.list_released(self.problem, phase) if phase.until.is_release else ()
                 is_end = lost and event.contact in released

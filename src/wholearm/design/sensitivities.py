@@ -230,15 +230,13 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
     return evaluate
 
 
-def _adopt(part: stage.Stage, problem: Problem) -> stage.Stage:
+def _adopt(part: stage.Stage, new: Problem) -> stage.Stage:
     """A stage in the scene of a problem in own units."""
-    until, ahead = problem.phases[part.phase].until, part.ahead
+    until, ahead = new.phases[part.phase].until, part.ahead
     if ahead is not None and until.value is not None:
         ahead = ahead[0], until.value, ahead[2]
-    gained = part.gained and stage.make_formation(problem.scene, *part.gained.equations[1:])
-    return replace(
-        part.move_to(problem.scene), gained=gained, until=part.until and until, ahead=ahead
-    )
+    gained = part.gained and stage.make_formation(new.scene, *part.gained.equations[1:])
+    return replace(part.move_to(new.scene), gained=gained, until=part.until and until, ahead=ahead)
 
 
 def find_lagrangian(planning: Planning) -> Evaluate:
@@ -347,20 +345,16 @@ def find_sensitivities(
 
 
 def _find_one(
-    problem: Problem,
-    goal: Objective,
-    parts: Sequence[str],
-    methods: Sequence[Method],
-    parameter: Parameter,
+    problem: Problem, goal: Objective, parts: Sequence[str], methods: Sequence[Method], p: Parameter
 ) -> Sensitivity:
     """The sensitivity to one number, by the first method that can evaluate one of its sides."""
-    size, failure = max(abs(parameter.value), LEAST_SIZE * parameter.scale), ""
-    values_of = parameter.name, parameter.value, parameter.unit
+    size, failure = max(abs(p.value), LEAST_SIZE * p.scale), ""
+    values_of = p.name, p.value, p.unit
     for method, step, nominal, evaluate in methods:
         sides, note = list[tuple[float, Terms]](), ""
         for change, text in ((step, "with less only: "), (-step, "with more only: ")):
             try:
-                changed = problem.with_({parameter.name: parameter.value + change * size})
+                changed = problem.with_({p.name: p.value + change * size})
                 sides.append((change * size, evaluate(changed, changed.start)[0]))
             except (WholearmError, ValueError) as error:
                 note, failure = f"{text}{error}", str(error)

@@ -176,8 +176,7 @@ class Planner:
 def find_limit(plan: Plan) -> tuple[str, float]:
     """The limit that is active for the longest time, and its fraction of the duration.
 
-    The limit of normal forces is the plan's least one, which the objective margin raises above
-    epsilon.
+    The bound on normal forces is the least one of the plan, as the objective margin raises it.
     """
     motion = plan.trajectory
     least, contact = min(motion.least_forces)

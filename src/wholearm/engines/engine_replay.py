@@ -43,7 +43,7 @@ from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..problem.read import read_own_problem
-from ..results.adopt import HasTrajectory, adopt_motion
+from ..results.adopt import MotionLike, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Samples, Trajectory
 from ..scene.model import Scene
@@ -526,7 +526,7 @@ def require_engine(name: str) -> Engine:
 def replay_in(
     engine: str,
     problem: Problem,
-    plan: Trajectory | HasTrajectory,
+    plan: Trajectory | MotionLike,
     *,
     whole: bool = False,
     setting: Setting | None = None,
@@ -717,7 +717,7 @@ class PolicyReport(Result):
 def play_policy(
     engine: str,
     problem: Problem,
-    plan: Trajectory | HasTrajectory,
+    plan: Trajectory | MotionLike,
     policy: Policy,
     *,
     whole: bool = False,

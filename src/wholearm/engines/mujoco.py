@@ -16,7 +16,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import require_number
 from ..problem.definition import Problem
-from ..results.adopt import HasTrajectory, adopt_motion
+from ..results.adopt import MotionLike, adopt_motion
 from ..results.torque import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
@@ -38,7 +38,7 @@ RATIO = 100.0  # impedance of friction over that of the gap
 
 def write_mjcf(
     problem: Problem,
-    plan: Trajectory | HasTrajectory | None = None,
+    plan: Trajectory | MotionLike | None = None,
     *,
     step: float | None = None,
     softness: float = 1.0,

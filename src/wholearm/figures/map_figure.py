@@ -23,7 +23,7 @@ from ..common.arrays import Array, Flags, Numbers, find_runs, interpolate
 from ..common.sharing import exclusive
 from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
-from ..results.adopt import HasTrajectory
+from ..results.adopt import MotionLike
 from ..results.trajectory import Trajectory
 from .style import INK, add_line, inset, open_figure, write, write_title
 
@@ -46,7 +46,7 @@ _ARROW = np.array(
 
 
 @exclusive
-def draw_map(chart: FormationMap, plan: Trajectory | HasTrajectory | None = None) -> Figure:
+def draw_map(chart: FormationMap, plan: Trajectory | MotionLike | None = None) -> Figure:
     """Draw a contact-formation map.
 
     The path of `plan` is drawn over the map, phase by phase; by default that of the problem's

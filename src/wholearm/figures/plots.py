@@ -123,7 +123,6 @@ def choose_numbers(
     All vertices have one if there is room, or every second, fifth, tenth, ... one, and those of
     `first` before others. A number is inside, or outside of an object with up to 5 vertices, which
     may be thin, and its middle at `lowest` or above. Vertices, (n, 2), and heights are in points.
-    The positions rotate with the object.
     """
     count = len(vertices)
     along = np.roll(vertices, -1, axis=0) - vertices

@@ -42,7 +42,7 @@ from ..mechanics.path_limits import PathLimits, find_value_rows
 from ..mechanics.sensitivity import Sensitivity
 from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
 from ..problem.definition import GROUPS, PARAMETERS, End, Phase, Problem, change_scene
-from ..results.adopt import HasTrajectory, adopt_motion
+from ..results.adopt import MotionLike, adopt_motion
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .curve_law import LoopSettings
@@ -629,7 +629,7 @@ def pass_renamed(problem: Problem) -> Problem:
 
 def make_policy(
     problem: Problem,
-    plan: Trajectory | HasTrajectory,
+    plan: Trajectory | MotionLike,
     *,
     reserve: float | None = None,
     period: float = 1e-3,

@@ -17,7 +17,7 @@ from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory
 
 
-class HasTrajectory(Protocol):
+class MotionLike(Protocol):
     """Object with a trajectory: a plan, a simulation, a report."""
 
     @property
@@ -25,7 +25,7 @@ class HasTrajectory(Protocol):
         """The motion with its forces and torques."""
 
 
-Torques = TorqueProfile | Trajectory | HasTrajectory  # objects that have torques
+Torques = TorqueProfile | Trajectory | MotionLike  # objects that have torques
 
 
 def split_torques(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:

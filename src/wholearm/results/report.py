@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from ..common.document import Document, Result, Table, fixed
-from .adopt import HasTrajectory
+from .adopt import MotionLike
 from .trajectory import Trajectory
 
 DEPARTURE = 1e-3  # largest `Deviation` from a plan, over the scene's length, and in rad
@@ -277,7 +277,7 @@ class Report(Result):
     changes: tuple[ModeChange, ...] = ()  # in the order of time
     reduced: tuple[ReducedState, ...] = ()  # along the replay, if requested
     help: TuningHelp = field(default_factory=TuningHelp)  # advice on tuning of the torques
-    replay: HasTrajectory | None = field(default=None, repr=False, compare=False)  # the simulation
+    replay: MotionLike | None = field(default=None, repr=False, compare=False)  # the simulation
 
     derived = ("ok", "exit_status", "reason")
 

@@ -24,24 +24,18 @@ from ..geometry.tracing import EndDistance
 from ..policy.make import make_policy
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import End, Phase, Problem
-from ..results.adopt import (
-    HasTrajectory,
-    Torques,
-    adopt_motion,
-    adopt_torques,
-    require_same_contacts,
-)
+from ..results.adopt import MotionLike, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.report import DEPARTURE, Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verify import LIMIT_TOLERANCE, REST_SPEED, describe_motors, describe_violations, measure_speed
+from .verify import LIMIT_TOLERANCE, REST_SPEED, describe_excess, describe_motors, measure_speed
 
 MAX_EVENTS = 60  # largest number of events in the text; `to_dict` has all
-CLOSING_TIME = 0.1  # time to close contacts that are open where a phase begins, over the scene's
-TOUCH_EVENTS = EventKind.IMPACT, EventKind.GAINED, EventKind.PASS  # events of a contact that closes
-END_DISTANCE, END_ANGLE = 0.03, math.radians(1.0)
+GRACE = 0.1  # time to close contacts that are open where a phase begins, over the scene's
+TOUCHES = EventKind.IMPACT, EventKind.GAINED, EventKind.PASS  # events of a contact that closes
+END_SHIFT, END_ANGLE = 0.03, math.radians(1.0)
 """Tolerances of a policy's end from the plan's: over the scene's length, and in rad."""
 
 
@@ -111,7 +105,7 @@ def verify_free(
 @exclusive
 def verify_policy(
     problem: Problem,
-    plan: Trajectory | HasTrajectory,
+    plan: Trajectory | MotionLike,
     policy: Policy,
     *,
     tolerance: float = 1e-9,
@@ -121,7 +115,7 @@ def verify_policy(
     """Report on a simulation of the closed loop from the problem's start.
 
     Contacts of a phase have to hold from its start until the contact that it gains touches. One
-    that is open at the start, and closes within `CLOSING_TIME`, is a warning.
+    that is open at the start, and closes within `GRACE`, is a warning.
 
     Parameters
     ----------
@@ -140,7 +134,7 @@ def verify_policy(
     until = loop.find_limit(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
-    phases, grace = list[FreePhase](), CLOSING_TIME * problem.scene.scales.time
+    phases, grace = list[FreePhase](), GRACE * problem.scene.scales.time
     motors = describe_motors(problem, whole.torque, policy.settings.period)
     warnings, last = (warn("whole", whole) + [text for _, text in motors], float(whole.t[-1]))
     if whole.events and whole.events[-1].kind is EventKind.REST:
@@ -164,7 +158,7 @@ def verify_policy(
         ]
         if not reached:
             failures.append(f"phase {number} does not end within {until:.4g} s")
-    far = end.position / problem.scene.scales.length > END_DISTANCE or end.angle > END_ANGLE
+    far = end.position / problem.scene.scales.length > END_SHIFT or end.angle > END_ANGLE
     if len(phases) == count and far:
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
@@ -174,7 +168,7 @@ def verify_policy(
 
 def find_policy(
     problem: Problem,
-    plan: Trajectory | HasTrajectory,
+    plan: Trajectory | MotionLike,
     *,
     contact_speed: float | None = None,
     departure: float = DEPARTURE,
@@ -226,13 +220,11 @@ def measure_end(simulation: Simulation, plan: Trajectory, index: int, stop: floa
 
 
 def _list_excess(simulation: Simulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:
-    """Sentences of `describe_violations` on phases from their start to their stop."""
+    """Sentences of `describe_excess` on phases from their start to their stop."""
     problem_phases = simulation.problem.phases
     spans = ((problem_phases[phase.number - 1], (phase.start, phase.stop)) for phase in phases)
     return [
-        text
-        for phase, span in spans
-        for text in describe_violations(phase, simulation, allowed, span)
+        text for phase, span in spans for text in describe_excess(phase, simulation, allowed, span)
     ]
 
 
@@ -263,12 +255,9 @@ def _find_end(
     """
     problem, scene, rows = simulation.problem, simulation.problem.scene, simulation.t >= start
     t, z, length = simulation.t[rows], simulation.z[rows], scene.scales.length
-    events, until = (
-        [e for e in simulation.events if e.time >= start],
-        phase.until.lead(z[0], length),
-    )
+    later, until = [e for e in simulation.events if e.time >= start], phase.until.lead(z[0], length)
     if until.is_release:
-        lost = [e for e in events if e.kind is EventKind.CONTACT_LOST]
+        lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
         times = [e.time for e in lost if e.contact in list_released(problem, phase)]
         return min(times, default=None), "" if times else "does not end: nothing is released"
     end = EndDistance(scene, until, z[0])
@@ -280,7 +269,7 @@ def _find_end(
         gaps, low = (part[:, system.names.index(name)] for part in system.measure(z))
         left = np.maximum(gaps, -low) / length
         closed = [s for s in simulation.stretches if s.contact == name and s.stop > start]
-        times = [e.time for e in events if e.contact == name]
+        times = [e.time for e in later if e.contact == name]
         times += [max(s.start, start) for s in closed]
     stop = min(times, default=math.inf)
     if phase.end is End.REST:
@@ -314,7 +303,7 @@ def find_touch(simulation: Simulation, contacts: Collection[str], start: float) 
 
     A bounce counts: its impact may open other contacts.
     """
-    times = [e.time for e in simulation.events if e.kind in TOUCH_EVENTS and e.contact in contacts]
+    times = [e.time for e in simulation.events if e.kind in TOUCHES and e.contact in contacts]
     times += [s.start for s in simulation.stretches if s.contact in contacts]
     return min((time for time in times if time > start), default=math.inf)
 

@@ -202,7 +202,7 @@ def judge(
         for time, text in describe_motors(problem, torque)
     ]
     for phase in problem.phases[: len(phases)]:
-        misses += [(phase.number, text) for text in describe_violations(phase, simulation, allowed)]
+        misses += [(phase.number, text) for text in describe_excess(phase, simulation, allowed)]
     if plan is not None:
         failures += [results.Failure(max(number, 1), text) for number, text in misses]
         # The departure of later phases follows from that of the first.
@@ -359,7 +359,7 @@ def _find_least(
         yield name, least, time
 
 
-def describe_violations(
+def describe_excess(
     phase: Phase, simulation: Simulation, allowed: float, span: tuple[float, float] | None = None
 ) -> list[str]:
     """Sentences on limits that a phase exceeds by `allowed` of their scale, in a `span` [s].
