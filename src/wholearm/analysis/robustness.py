@@ -180,7 +180,7 @@ class Trial:
         if not isinstance(execution, ClosedLoop):
             delay = changes.get("delay", 0.0)
             return self.judge(simulation, 0.0, [stop + delay for stop in self.stops])
-        # A phase begins when its first torques take effect; the last one goes on to the end.
+        # A phase begins when its first torques take effect; the last one lasts until the end.
         end = float(simulation.t[-1])
         starts = {number: time + execution.delay for number, time in execution.phase_starts.items()}
         starts[self.phases[-1].number + 1] = end

@@ -71,7 +71,7 @@ def predict(
     InputError if the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
-    level = SHARE.read(squeeze, "squeeze")
+    ratio = SHARE.read(squeeze, "squeeze")
     predictions: list[PhasePrediction] = []
     z, in_motion = problem.start, False
     with name_source(problem.source):
@@ -81,7 +81,7 @@ def predict(
             later = problem.phases[phase.index + 1 :]
             path = sample_path(phase, z, later)
             at_rest = not in_motion, phase.end is End.REST
-            predictions.append(_predict_phase(problem, phase, path, at_rest, level))
+            predictions.append(_predict_phase(problem, phase, path, at_rest, ratio))
             z = find_end(phase, z, later) if path is None else path.point.z[-1]
             in_motion = phase.end is not End.REST
     return Prediction(problem.name, problem.epsilon, tuple(predictions))
@@ -105,7 +105,7 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
 
 def _predict_phase(
-    problem: Problem, phase: Phase, path: PathSamples | None, rest: tuple[bool, bool], share: float
+    problem: Problem, phase: Phase, path: PathSamples | None, rest: tuple[bool, bool], ratio: float
 ) -> PhasePrediction:
     names, until = phase.formation.names, str(phase.until)
     if path is None:
@@ -115,7 +115,7 @@ def _predict_phase(
         name: (evaluate_best(path, name), PROFILES[name][1] * path.length)
         for name in ("steady", motion_name)
     }
-    torques = find_torques(path, problem.epsilon, share)
+    torques = find_torques(path, problem.epsilon, ratio)
     if torques is not None:
         motions[OWN_TORQUES] = (evaluate_torques(path, torques.tau), path.length)
         # Every eighth place, with both ends and both sides of every reversal.

@@ -342,7 +342,7 @@ class PassageTuner:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
         self.until = passage.phases[-1].until
         self.end = EndDistance.to_leading(problem.scene, self.until, z)
-        self.length = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
+        self.length = float(self.measure(z[None])[0])  # distance of the end [m or rad]
         self.limit, self.gains_contact = problem.scene.torque_limit, self.until.contact is not None
         scales, self.time = problem.scene.scales, problem.scene.scales.time
         self.slow = SETTINGS.slow * (scales.rate if self.end.unit == "rad" else scales.speed)
@@ -567,22 +567,22 @@ class PassageTuner:
         return None if last is None else best._replace(trial=last)
 
     def _time_brake(
-        self, steps: list[TuningStep], drive: TuningTrial, near: TuningTrial | None, speed: float
+        self, steps: list[TuningStep], drive: TuningTrial, similar: TuningTrial | None, speed: float
     ) -> TuningTrial | None:
         """Trial with the instant of the last step at which the object reaches the end slowly.
 
-        False position on the distance from the end and the overshoot. `near` is a trial of a weaker
-        brake, or with nearly the same instant, from which the search begins.
+        False position on the distance from the end and the overshoot. The search begins near a
+        `similar` trial, of a weaker brake or with nearly the same instant.
         """
         low, high = 0.0, drive.time
-        below, above = self.length, self._overshoot(drive, speed)
+        error_low, error_high = self.length, self._overshoot(drive, speed)
         instant, side, losses = 0.5 * high, 0, 0
         distance, rate = self.length, drive.rate
-        if near is not None and speed == self.slow:
-            high, above = near.steps[-1].time, self._overshoot(near, speed)
+        if similar is not None and speed == self.slow:
+            high, error_high = similar.steps[-1].time, self._overshoot(similar, speed)
             instant = high * (1 - 1e-4)
-        elif near is not None:
-            instant = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
+        elif similar is not None:
+            instant = min(1.02 * similar.steps[-1].time, 0.5 * (similar.steps[-1].time + high))
         for count in range(SETTINGS.max_trials):
             steps = [*steps[:-1], steps[-1]._replace(time=instant)]
             trial = self.run(steps, f"brake at {instant:.5g} s")
@@ -591,8 +591,8 @@ class PassageTuner:
                     return trial
                 if instant < SETTINGS.bracket * drive.time:
                     return self._find_graze(steps, drive) if self.is_free else None
-                high, above, rate = instant, self._overshoot(trial, speed), trial.rate
-                below /= 2 if side < 0 else 1
+                high, error_high, rate = instant, self._overshoot(trial, speed), trial.rate
+                error_low /= 2 if side < 0 else 1
                 side = -1
             else:
                 losses += trial.outcome is TrialOutcome.LOSES
@@ -600,13 +600,15 @@ class PassageTuner:
                     return None
                 low, distance = instant, trial.short
                 # The distance through several phases is not known.
-                below = above if distance == math.inf else max(distance, 1e-12 * self.length)
-                above /= 2 if side > 0 else 1
+                error_low = (
+                    error_high if distance == math.inf else max(distance, 1e-12 * self.length)
+                )
+                error_high /= 2 if side > 0 else 1
                 side = 1
             jumps = distance > SETTINGS.far * self.length and rate > SETTINGS.fast * drive.rate
             if jumps and high - low < SETTINGS.bracket * high:
                 return None
-            fraction = below / (below + above) if count % 4 != 3 else 0.5
+            fraction = error_low / (error_low + error_high) if count % 4 != 3 else 0.5
             instant = low + (high - low) * min(max(fraction, 0.02), 0.98)
             if high - low < 1e-12 * high:
                 return None
@@ -615,9 +617,8 @@ class PassageTuner:
     def _find_graze(self, steps: list[TuningStep], drive: TuningTrial) -> TuningTrial | None:
         """Trial with the instant of the brake at which the object just touches the end.
 
-        With two freedoms the object may turn back before the end, and reach it later on another
-        path: it arrives at all instants, and its speed falls to zero, with a kink, where it just
-        touches. Golden-section search from a grid.
+        Golden-section search from a grid. With two freedoms the object may turn back before the end
+        and reach it on another path: its speed has a kink, of value zero, where it just touches.
         """
 
         def run(instant: float) -> tuple[float, TuningTrial]:

@@ -474,7 +474,7 @@ def refuse(options: argparse.Namespace, problem: str, *names: str) -> None:
 
 
 def require_with(options: argparse.Namespace, required: str, *names: str) -> None:
-    """InputError if an option is not set, but one of those that need it."""
+    """InputError if an option is not set, but another one that needs it."""
     if getattr(options, required) in (None, False):
         refuse(options, f"needs --{required.replace('_', '-')}", *names)
 
@@ -658,7 +658,7 @@ def _plot(options: argparse.Namespace) -> int:
 
 
 def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.Simulation | None:
-    """Simulate the torques of a trajectory; `simulator` is told or free, or None for nothing."""
+    """Simulation of the torques of a trajectory by a simulator, told or free; None without one."""
     if simulator is None:
         return None
     from ..problem.read import read_own_problem

@@ -433,8 +433,8 @@ def sweep(
                 journal.add({"point": number, "row": answer})
             if progress is not None:
                 done, count = len(rows), len(points)
-                rest = (time.monotonic() - began) / max(done - n_stored, 1) * (count - done)
-                time_left = f"{rest:.0f} s" if rest < 100 else f"{rest / 60:.0f} min"
+                seconds = (time.monotonic() - began) / max(done - n_stored, 1) * (count - done)
+                time_left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
                 bar = f"[{'#' * (20 * done // count):.<20}]"
                 progress(f"{bar} {done} of {count} points, {time_left} left")
     all_rows = (

@@ -150,8 +150,8 @@ class _Drawing:
             return None
         step = np.array([self.phi[1] - self.phi[0], self.x[1] - self.x[0]]) * self.scale[::-1]
         label = np.array([6.5, 2.2 * len(text) + 1.0])  # a letter is 4.4 points wide
-        # Measured in half labels, the room around a place is the largest label that fits. Cells of
-        # discs are narrow: there it stands upright.
+        # Measured in half labels, the room around a place is the largest label that fits. In narrow
+        # cells, as of discs, the label is upright.
         for half, angle in ((label, 0), (label[::-1], 90)):
             row, column, room = find_room(region, step / half)
             if room >= 1.15:

@@ -102,7 +102,7 @@ def draw_prediction(prediction: Prediction) -> Figure:
     phases = [phase for phase in prediction.phases if phase.curves is not None]
     columns = min(3, max(len(phases), 2))
     rows = max(math.ceil(len(phases) / columns), 1)
-    # Size of a panel with what is written about it, and the room that this takes [in].
+    # Size of a panel with texts and margins, and these margins [in].
     (width, height), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
     scales = [_measure_force(phase, prediction.epsilon) for phase in phases]
     prefix, factor = style.choose_prefix(2.2 * max(scales, default=prediction.epsilon))
@@ -356,9 +356,9 @@ def _draw_lines(
         (values, reasons), (dash, marker) = _values(rows), style.LINES[number % len(style.LINES)]
         look: Any = {"color": style.PALETTE[number % len(style.PALETTE)], "marker": marker, "ms": 3}
         axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
-        level, borders, first = height * (number + 0.5), _cell_edges(x), 0
+        height_of_row, borders, first = height * (number + 0.5), _cell_edges(x), 0
         if len(lines) > 1 and any(reasons):
-            axes.plot(-0.02, level, transform=axes.transAxes, clip_on=False, **look)
+            axes.plot(-0.02, height_of_row, transform=axes.transAxes, clip_on=False, **look)
         for reason, group in groupby(reasons):
             last = first + len(list(group))
             left, right, colour = borders[first], borders[last], colours.get(reason, "")
@@ -367,7 +367,7 @@ def _draw_lines(
                 if last - first > LABELLED * len(rows):
                     _write(axes, reason, colour, (left + right) / 2, 0.5, transform)
             elif reason:
-                places = np.full(last - first, level)
+                places = np.full(last - first, height_of_row)
                 axes.plot(x[first:last], places, "x", color=colour, transform=transform)
             first = last
     if not single and sweep.reasons:

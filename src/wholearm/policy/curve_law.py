@@ -6,10 +6,8 @@ limits, affine in a, b, s' and the internal force (`make`). Each period of `Curv
 * projects joint angles and speeds onto the table: s and s';
 * predicts both for the middle of the interval in which its torques are held;
 * asks for a = mean reference a + proportional and integral feedback on the speed;
-* takes the internal force with the largest least normalized slack of all limits and, if that is
-  below its floor, moves a towards the reference until the floor is kept.
-
-The normalized slack of a limit is its slack over its robustness margin.
+* takes the internal force with the largest least normalized slack (slack over robustness margin) of
+  all limits and, if that is below its floor, moves a towards the reference until it is kept.
 
 At the end the motion continues at touching speed until the joints stop while the drive rises, or
 until they are well beyond the end: the contact is made. The torques of the next law then hold the
@@ -93,10 +91,10 @@ class CurveLaw:
     ----------
     finished      whether the next phase may begin
     contact_made  whether the contact at the end has been made
-    passed        number of phases that have been passed
-    next_chord    first chord of the next law, if it is along a curve and entered in motion
-    brake         the next law, if it is along a curve and `push` is held until it begins
-    successor     the next law, if it is along a curve and holds the joints at the end
+    passed        number of passed phases
+    next_chord    first chord of the next law along a curve, if that is entered in motion
+    brake         next law along a curve, if `push` is held until it begins
+    successor     next law along a curve, if it holds the joints at the end
     s, v          arc length and speed at the last step
     """
 
@@ -386,7 +384,7 @@ class LoopSettings(NamedTuple):
     """Settings that the laws of all phases share."""
 
     period: float  # [s]: of the control loop
-    delay: float  # [s]: from measuring to applying torques, as far as known
+    delay: float  # [s]: expected time from measuring to applying torques
     touch: float  # [m/s]: speed s' at which contacts are made
     still: float  # [m/s]: speed s' below which the motion is at rest
     dwell: float  # [s]: time at rest before the next phase begins

@@ -88,10 +88,10 @@ class ReferenceSettings:
 SETTINGS = ReferenceSettings()
 UNLIMITED = np.array([1e9, 0.0, 0.0, 0.0, 0.0])
 FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
-"""Columns that torques do not change: all but those of s'' and the internal force."""
+"""1 for columns that torques do not change, 0 for those of s'' and the internal force."""
 CORNERS = ("mass", "inertia", *GROUPS["friction"])
-"""Numbers whose ranges have corners; those of geometry and gains count to first order. The start is
-measured, and a delay is in torques."""
+"""Numbers whose ranges have corners. Those of geometry and gains are treated to first order, delays
+by delayed torques; the start is measured."""
 ERRORS = dict.fromkeys(CORNERS, 0.1) | {"mass": 0.05, "inertia": 0.05, "gain1": 0.01, "gain2": 0.01}
 """Relative uncertainties without ranges."""
 
@@ -647,7 +647,7 @@ def make_policy(
                           changes by masses that are 5 %, friction that is 10 % and torques that are
                           1 % off (2.5). If the plan has less, the motion is slower; 0: as the plan
     period : [s]          of the control loop
-    delay : [s]           from measuring to applying torques, as far as known
+    delay : [s]           expected time from measuring to applying torques
     contact_speed         factor on the speed at which contacts are made; times at rest before the
                           next phase begins are longer by its inverse square
     torque_limit : [N m]  of both fingers, if the plan was made with less than the hand has
@@ -696,7 +696,7 @@ def make_policy(
                 seconds = float(find_duration(piece.b, np.diff(piece.rows.s)))
                 seconds += 0.0 if piece.passes else settings.dwell + delay
                 entry |= {"duration": seconds, "share": piece.share, "reserves": piece.reserves}
-                # The plan goes on in motion there.
+                # The policy stops at an end that the plan passes in motion.
                 planned_end = phases[phase.index].end
                 entry["stops"] = phase.end is End.REST and planned_end is not End.REST
                 entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name

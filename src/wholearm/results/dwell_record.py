@@ -32,7 +32,7 @@ class TorqueChange:
     before: Array  # (2,) [N m]
     after: Array  # (2,) [N m]
     times: Array  # (n + 1,) [s]: from 0 on
-    levels: Array  # (n + 1,): sigma at these times
+    sigma: Array  # (n + 1,): sigma at these times
     rates: Array  # (n,) [1/s]: its rate of change just after them
     decays: Array  # (n,) [1/s]: decay rates of this rate
 
@@ -47,7 +47,7 @@ class TorqueChange:
         k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.rates) - 1)
         elapsed, decay = t - self.times[k], self.decays[k]
         decayed = -np.expm1(-decay * elapsed) / np.where(decay > 0, decay, 1.0)
-        return np.asarray(self.levels[k] + self.rates[k] * np.where(decay > 0, decayed, elapsed))
+        return np.asarray(self.sigma[k] + self.rates[k] * np.where(decay > 0, decayed, elapsed))
 
     @property
     def torque(self) -> TorqueProfile:
@@ -65,11 +65,11 @@ class TorqueChange:
 
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
     """Change between torques of shape (2,) [N m] in least time."""
-    levels, spans, rates, decays = _divide(scene, before, after)
+    sigma, spans, rates, decays = _divide(scene, before, after)
     nonempty = spans > 0
     times = np.append(0.0, np.cumsum(spans[nonempty]))
-    levels = np.append(levels[:-1][nonempty], levels[-1])
-    return TorqueChange(before, after, times, levels, rates[nonempty], decays[nonempty])
+    sigma = np.append(sigma[:-1][nonempty], sigma[-1])
+    return TorqueChange(before, after, times, sigma, rates[nonempty], decays[nonempty])
 
 
 def find_change_times(scene: Scene, before: Array, after: Array) -> Array:
@@ -99,15 +99,15 @@ def _divide(scene: Scene, before: Array, after: Array) -> tuple[Array, Array, Ar
             if decay[k] != decay[m]:
                 crossing = (lines[..., k] - lines[..., m]) / (decay[k] - decay[m])
                 crossings.append(np.clip(crossing, 0.0, 1.0))
-    levels = np.sort(np.stack(crossings, axis=-1), axis=-1)
-    middles = (levels[..., 1:] + levels[..., :-1]) / 2
+    sigma = np.sort(np.stack(crossings, axis=-1), axis=-1)
+    middles = (sigma[..., 1:] + sigma[..., :-1]) / 2
     least = np.argmin(lines[..., None, :] - decay * middles[..., None], axis=-1)
     beta = decay[least]
-    rates = np.take_along_axis(lines, least, axis=-1) - beta * levels[..., :-1]
-    rise = np.diff(levels)
+    rates = np.take_along_axis(lines, least, axis=-1) - beta * sigma[..., :-1]
+    rise = np.diff(sigma)
     decayed = -np.log1p(-beta * rise / rates) / np.where(beta > 0, beta, 1.0)
     spans = np.where(beta > 0, decayed, rise / rates)
-    return levels, spans * changing[..., None], rates, beta
+    return sigma, spans * changing[..., None], rates, beta
 
 
 class Settling(NamedTuple):

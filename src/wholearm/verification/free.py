@@ -148,13 +148,13 @@ def verify_policy(
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))
         warnings += _list_excess(whole, phases[-1:], LIMIT_TOLERANCE)
-        lost = [loss for loss in losses if loss.closes > start + grace]
-        failures += [loss.describe(number) for loss in lost]
+        lasting = [loss for loss in losses if loss.closes > start + grace]
+        failures += [loss.describe(number) for loss in lasting]
         warnings += [
             f"{loss.contact} is open where phase {number} begins, by {loss.gap:.2g} m, and closes "
             f"within {loss.closes - start:.2g} s"
             for loss in losses
-            if loss not in lost
+            if loss not in lasting
         ]
         if not reached:
             failures.append(f"phase {number} does not end within {until:.4g} s")
@@ -363,7 +363,7 @@ class LostContact(NamedTuple):
 
     contact: str
     time: float  # [s]: when it stops pressing
-    gap: float  # [m]: by how much it opens
+    gap: float  # [m]: largest gap
     closes: float  # [s]: when it presses again, or the phase ends
 
     def describe(self, phase: int | None = None) -> str:
