@@ -29,13 +29,7 @@ from wholearm.planning.plan import solve
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import CONE_TOLERANCE, Balance, balance
-from wholearm.verification.verify import (
-    FORCE_TOLERANCE,
-    Allowance,
-    find_force_tolerance,
-    list_normal_forces,
-    verify,
-)
+from wholearm.verification.verify import DEFICIT, Allowance, list_normal_forces, max_deficit, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 
@@ -470,9 +464,9 @@ def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
     least = np.nanmin(fine.c_n)
     lowest = int(np.where(np.isnan(fine.c_n), np.inf, fine.c_n).min(axis=1).argmin())
     assert least > 0.0 and start < fine.t[lowest] < stop
-    rounding = find_force_tolerance(problem) - FORCE_TOLERANCE * problem.epsilon
+    rounding = max_deficit(problem) - DEFICIT * problem.epsilon
     for more, fails in (1e-3, True), (-1e-3, False):
-        epsilon = (least + rounding) / (1 - FORCE_TOLERANCE - more)
+        epsilon = (least + rounding) / (1 - DEFICIT - more)
         texts = verify(problem.with_(epsilon=epsilon), torque).warnings
         assert any(" falls to " in text for text in texts) is fails
 
@@ -600,7 +594,7 @@ def test_a_contact_that_is_let_go_counts_until_then() -> None:
     phase = verify(problem, trajectory).phases[0]
     assert phase.until == "release of v3-finger1"
     margins = {margin.contact: margin for margin in phase.contacts}
-    assert margins["v3-finger1"].least > problem.epsilon - find_force_tolerance(problem)
+    assert margins["v3-finger1"].least > problem.epsilon - max_deficit(problem)
     contact, least, time, _ = min(phase.contacts, key=lambda margin: margin.least)
     assert phase.least_force == (least, contact, 1, time)
     assert phase._replace(contacts=()).least_force is None

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .free import FreeReport
 
 REST_SPEED = 2e-2  # largest speed of rest at the end of a phase, relative to the scene's speed
-FORCE_TOLERANCE = 2e-3  # tolerance of normal forces of a plan below epsilon, over epsilon
+DEFICIT = 2e-3  # tolerated deficit of normal forces of a plan below epsilon, over epsilon
 EXACT_REST = 1e-9  # speed of rest but for rounding, relative to the scene's speed
 N_INSTANTS = 33
 """Instants of a phase at which uniqueness margins and torques are evaluated."""
@@ -257,7 +257,7 @@ def _report_phase(
     if uniqueness:
         # From the start of its motion on, if it moves.
         starts = [e.time for e in simulation.find(EventKind.START, phase=index)]
-        stuck = find_stuck_time(problem, phase, simulation, REST_SPEED, *starts[:1])
+        stuck = find_stuck(problem, phase, simulation, REST_SPEED, *starts[:1])
         uniqueness_margin = find_uniqueness_margin(phase, simulation, rows)
     if plan is not None:
         end_deviation, deviation = _compare(simulation, plan, phase, bool(arrivals))
@@ -428,9 +428,9 @@ def describe_motors(
     return misses
 
 
-def find_force_tolerance(problem: Problem) -> float:
-    """Tolerance of normal forces of a plan below epsilon, rounding included [N]."""
-    return 5e-7 * problem.scene.scales.force + FORCE_TOLERANCE * problem.epsilon
+def max_deficit(problem: Problem) -> float:
+    """Tolerated deficit of normal forces of a plan below epsilon, rounding included [N]."""
+    return 5e-7 * problem.scene.scales.force + DEFICIT * problem.epsilon
 
 
 def measure_speed(scene: Scene, v: Array) -> float:
@@ -512,7 +512,7 @@ def describe_low_forces(
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
     for phase in phases:
         for c in phase.contacts:
-            thin = c.margin < -find_force_tolerance(problem)
+            thin = c.margin < -max_deficit(problem)
             if thin and (phase.number, c.contact) not in lost:
                 text = f"below epsilon = {problem.epsilon:g} N, at t = {c.time:.5g} s"
                 text = f"c_n of {c.contact} falls to {c.least:.5g} N, {text}, phase {phase.number}"
@@ -525,7 +525,7 @@ def find_uniqueness_margin(
     """The least uniqueness margin in a phase; None if nothing moved.
 
     Contacts slide where forces are on a side of their cones, and stick elsewhere. Forces within
-    cones at rest do not count: they are statically indeterminate, see `find_stuck_time`. `rows` are
+    cones at rest do not count: they are statically indeterminate, see `find_stuck`. `rows` are
     those of the motion in the phase.
     """
     formation, rows = phase.formation, rows[:: -(-len(rows) // N_INSTANTS)]
@@ -550,7 +550,7 @@ def find_uniqueness_margin(
     return min(margins)
 
 
-def find_stuck_time(
+def find_stuck(
     problem: Problem, phase: Phase, motion: Trajectory | Simulation, rest: float, start: float = 0.0
 ) -> float | None:
     """Time for which friction may hold a phase that begins at rest (static indeterminacy) [s].
@@ -667,7 +667,7 @@ def find_help(
         if e.kind is not EventKind.SLIP or e.contact in rolling[e.phase]
     ]
     lost = {event[:2] for event in events}
-    tolerance = find_force_tolerance(problem)
+    tolerance = max_deficit(problem)
     events += [
         (phase.number - 1, margin.contact, "thin", margin.time)
         for phase in phases
