@@ -123,12 +123,12 @@ def _predict_phase(
         chosen = np.append(True, reversals) | np.append(reversals, True)
         chosen[::8] = True
         torques = QuasistaticTorques(*(part[chosen] for part in torques))
-    unit, survivals = problem.scene.scales.speed, list[Survival]()
+    unit, survivals = problem.scene.scales.speed, list[LimitSpeeds]()
     for name, (evaluate, path_length) in motions.items():
-        speed, again, least = find_break(evaluate, problem.epsilon, unit)
-        lost, *_ = find_break(evaluate, 0.0, unit, speed or 0.0)
+        speed, again, least = find_limit_speed(evaluate, problem.epsilon, unit)
+        lost, *_ = find_limit_speed(evaluate, 0.0, unit, speed or 0.0)
         duration = path_length / speed if speed else None
-        survivals.append(Survival(name, speed, duration, lost, again, _name(path, least)))
+        survivals.append(LimitSpeeds(name, speed, duration, lost, again, _name(path, least)))
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
     kept = (grasp.least >= problem.epsilon) & (path.inertia > 0)
@@ -177,7 +177,7 @@ def find_torques(path: PathSamples, epsilon: float, squeeze: float) -> Quasistat
     return QuasistaticTorques(path.s, path.point.z, forces.tau(zero, zero, internal), c_n)
 
 
-def _name(path: PathSamples, least: Least) -> Weakest:
+def _name(path: PathSamples, least: Least) -> CriticalLimits:
     parts = dict[str, dict[str, None]]()  # contacts, and others by kind of limit
     for limit in (path.force_limits.limits.limits[k] for k in least.limits):
         kind = "" if limit.kind in (PRESS, CONE) else limit.kind
@@ -185,7 +185,7 @@ def _name(path: PathSamples, least: Least) -> Weakest:
     contacts = tuple(parts.pop("", {}))
     others = tuple(f"{kind} of {' and '.join(each)}" for kind, each in parts.items())
     force = least.force if math.isfinite(least.force) else None
-    return Weakest(contacts, others, _place(path, least.place), force)
+    return CriticalLimits(contacts, others, _place(path, least.place), force)
 
 
 def _place(path: PathSamples, row: int) -> Place:
@@ -244,7 +244,7 @@ def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     return evaluate
 
 
-def find_break(
+def find_limit_speed(
     evaluate: Evaluate, required: float, unit: float, above: float = 0.0
 ) -> tuple[float | None, float | None, Least]:
     """The least speed at which the least force is below `required` [N], by bisection.
@@ -371,7 +371,7 @@ class Place(NamedTuple):
         return describe_pose(np.array(self[1:]))
 
 
-class Weakest(NamedTuple):
+class CriticalLimits(NamedTuple):
     """The limits that are violated first, and their place."""
 
     # one, or two of which the internal force selects one; none if other limits are the first
@@ -388,7 +388,7 @@ class Weakest(NamedTuple):
         return ", by ".join(filter(None, parts)) or "jams"
 
 
-class Survival(NamedTuple):
+class LimitSpeeds(NamedTuple):
     """Limit speeds of one kind of motion."""
 
     # "steady": constant speed, with the best internal force at each place; "rest to rest",
@@ -402,7 +402,7 @@ class Survival(NamedTuple):
     lost: float | None  # [m/s]: least peak speed at which a contact is lost
     # [m/s]: if `speed` is zero, the speed above which all contacts are kept
     again: float | None
-    first: Weakest  # the limits that are violated at `speed`
+    first: CriticalLimits  # the limits that are violated at `speed`
 
 
 class QuasistaticTorques(NamedTuple):
@@ -433,10 +433,10 @@ class PhasePrediction:
     path: str
     length: float  # [m]
     # least force of the quasistatic motion with the best internal force; None if left out
-    slow: Weakest | None = None
+    slow: CriticalLimits | None = None
     # stretches where the quasistatic motion keeps every contact
     kept: tuple[tuple[Place, Place], ...] = ()
-    survivals: tuple[Survival, ...] = ()
+    survivals: tuple[LimitSpeeds, ...] = ()
     torques: QuasistaticTorques | None = None  # None if no torques balance everywhere
     curves: Curves | None = None
 

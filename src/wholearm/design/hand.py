@@ -85,7 +85,7 @@ class Hand(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
+class HandCost:
     """Objective function of a design."""
 
     choices: tuple[Choice, ...]
@@ -150,7 +150,7 @@ class Aim:
 class Design(Result):
     """The best hand, its plans, and all evaluated hands."""
 
-    aim: Aim
+    aim: HandCost
     plans: tuple[Plan, ...]  # of the problems, with the best hand
     hands: tuple[Hand, ...]
 
@@ -261,7 +261,7 @@ def design_hand(
     rows = [planner.run((0, (index,))) for index in range(len(listed))]
     today = tuple(math.nan if row["value"] is None else row["value"] for row in rows)
     keys = tuple(key for c in choices for key in c.factors)
-    aim = Aim(choices, Planner(listed, keys, chosen), today, factors / factors.sum(), worst)
+    aim = HandCost(choices, Planner(listed, keys, chosen), today, factors / factors.sum(), worst)
     tasks = [partial(aim.search, start, budget, progress) for start in range(1, starts + 1)]
     hands = tuple(hand for searched in share(tasks, jobs) for hand in searched)
     feasible = [hand for hand in hands if not hand.reason]

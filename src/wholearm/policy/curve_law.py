@@ -178,7 +178,7 @@ class CurveLaw:
         reach = half * max(v, settings.touch)
         a_ref = (self._find_b(place + reach) - self._find_b(place - reach)) / (4.0 * reach)
         j, fraction = self._locate(s)
-        # Much slower than the reference the motion does not brake with it.
+        # A motion that is much slower than the reference does not brake with it.
         if a_ref < 0.0 and v < 0.5 * v_ref:
             a_ref = 0.0
         self.integral = min(max(self.integral + self.k_i * error, -settings.most), settings.most)

@@ -117,7 +117,7 @@ def add_limits_beyond(rows: CurveLimitRows, after: Curve) -> CurveLimitRows:
     directions = directions_of(after, np.zeros(1, dtype=np.int64))
     forces = inverse(formation, point, directions)
     limits = split_limits(formation)[0]
-    slack = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
+    slack = measure_slack(limits, find_response(forces, torque)[0], torque, point.z_s[:, 3:])
     beyond = np.tile(UNLIMITED, (len(rows.s), slack.shape[1], 1))
     beyond[-1] = slack[0] / (SETTINGS.force_margin * limits.side_scales)[:, None]
     return rows._replace(slack=np.concatenate([rows.slack, beyond], axis=1))
@@ -137,7 +137,7 @@ def find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
     return inverse(curve.formation, point, directions).of_tau
 
 
-def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
+def find_response(forces: PathForces, torque: Array) -> tuple[Array, Array]:
     """Contact forces, (n, n_c + R, 5), a and internal force, (n, 2, 5), from torques (n, 2, 5)."""
     free = [A, LAMBDA]
     motion = np.linalg.solve(forces.of_tau[..., free], torque - FIXED * forces.of_tau)
@@ -171,11 +171,11 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     levels = list[Array]()
     for directions in sides:
         forces = inverse(formation, point, directions)
-        c = respond(forces, torque)[0]
+        c = find_response(forces, torque)[0]
         slack = measure_slack(contact, c, torque, rates)
         state = Sensitivity.of_curve(formation, point, directions, forces)
         changes = np.array([*ERRORS.values()])[:, None] * state.find_slopes(tuple(ERRORS))
-        delay_change = respond(forces, lagged)[0] - c
+        delay_change = find_response(forces, lagged)[0] - c
         changes = np.append(changes, delay_change[:, :, None], axis=2)
         errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
         error = np.linalg.norm(force_gradients(contact) @ errors, axis=2)
@@ -241,11 +241,11 @@ def find_corners(
     torque, delayed, slope = torques
     for scene in list_scenes(formation.scene, widths):
         changed = replace(formation, scene=scene)
-        c, motion = respond(inverse(changed, point, directions), torque)
+        c, motion = find_response(inverse(changed, point, directions), torque)
         rows.append(measure_slack(split_limits(changed)[0], c, torque, point.z_s[:, 3:]))
         s_ddot.append(motion[:, 0])
     nominal = inverse(formation, point, directions)
-    changes = [respond(nominal, delayed)[0] - respond(nominal, torque)[0]]
+    changes = [find_response(nominal, delayed)[0] - find_response(nominal, torque)[0]]
     first_order = (*GROUPS["geometry"], *GROUPS["gain"])
     state = Sensitivity.of_curve(formation, point, directions, nominal)
     for name in (other for other in first_order if widths.get(other, 0.0) > 0):
@@ -253,7 +253,7 @@ def find_corners(
         if name in GROUPS["geometry"]:
             # Torques depend on the apparent place.
             shifted = torque + state.find_shifts(name)[:, None, None] * slope
-            slopes = slopes + respond(nominal, shifted)[0] - respond(nominal, torque)[0]
+            slopes = slopes + find_response(nominal, shifted)[0] - find_response(nominal, torque)[0]
         changes.append(widths[name] * slopes)
     of_c, margin = force_gradients(split_limits(formation)[0]), unit[:, None]
     return Corners(np.array(rows) / margin, np.array(s_ddot), of_c / margin @ np.array(changes))
@@ -399,7 +399,7 @@ def _trace(
     """
     rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
-    plan_s, *values = _follow(curve, plan, rows_of_phase)
+    plan_s, *values = _project(curve, plan, rows_of_phase)
     # Nodes of the table, with all reversals.
     s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, 121))) / 2
     s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
@@ -529,7 +529,7 @@ def retime_in_ranges(
     return best, low
 
 
-def _follow(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array, Array, Array]:
+def _project(curve: Curve, plan: Trajectory, rows: Numbers) -> tuple[Array, Array, Array, Array]:
     """Places s, a, b and internal force of a plan's rows along a curve."""
     formation, metric = curve.formation, metric_weights(curve.formation.scene)
     z, grid = plan.z[rows], np.linspace(0.0, curve.length, 400)
@@ -611,7 +611,7 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
     return None if problem.uncertainty is None else problem.ranges
 
 
-def pass_renamed(problem: Problem) -> Problem:
+def join_renamed(problem: Problem) -> Problem:
     """The problem without stops where phases along curves only rename a contact.
 
     Such an end does not stop the joints: they would go on far beyond it. Case: hexagon, phase 10,
@@ -678,7 +678,7 @@ def make_policy(
     durations, table, phases = np.diff(plan.phase_starts), problem.table, problem.phases
     if reserve and planner is not None:
         problem, plan = replan(planner, problem, plan)
-    problem = pass_renamed(problem)
+    problem = join_renamed(problem)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
     pieces = trace_pieces(problem, plan, reserve, widths, contact_speed)
     tables, entries = list[dict[str, Array]](), list[dict[str, Any]]()
@@ -724,5 +724,5 @@ def find_largest_factors(problem: Problem, plan: Trajectory, delay: float) -> di
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
     factor = min(SETTINGS.max_range / relative, 64.0) if relative > 0 else 64.0
-    pieces = trace_pieces(pass_renamed(problem), plan, factor, scale_ranges(ranges, factor, delay))
+    pieces = trace_pieces(join_renamed(problem), plan, factor, scale_ranges(ranges, factor, delay))
     return {index + 1: factor * piece.share for index, piece in pieces.items()}

@@ -110,7 +110,7 @@ def find_internal_force(slack: Array, a: Array, b: Array) -> tuple[Array, Array]
     return least, internal
 
 
-def follow(
+def track(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
 ) -> tuple[float, Array, Array, bool]:
     """Squared speed over the plan's, tau, (n, 2) [N m], and gains, (n, 2, 4), at n even times.
@@ -269,7 +269,7 @@ def tabulate_motion(
     inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
     # At the end each joint is critically damped, in contact or not.
     final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
-    b, tau, gains, presses = follow(problem, phases, plan, t)
+    b, tau, gains, presses = track(problem, phases, plan, t)
     speed = np.sqrt(b)
     rest_speed = REST_SPEED * problem.scene.scales.rate
     # Orthonormal basis of the joint displacements that the contacts at the end leave free.
@@ -320,7 +320,7 @@ def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Proble
         (block, *following), replacement = blocks, list[PhaseParts]()
         if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
             for stop, part, ratio in REPLAN_OPTIONS:
-                if split := _stop(block, plan, stop):
+                if split := _stop_at_release(block, plan, stop):
                     candidate = [*split, *following]
                     replacement = _replan_blocks(planner, problem, candidate, plan, part, ratio)
                 if replacement:
@@ -336,7 +336,7 @@ def replan(planner: Planner, problem: Problem, plan: Trajectory) -> tuple[Proble
     return replace(problem, phases=tuple(phases)), new_plan
 
 
-def _stop(
+def _stop_at_release(
     block: tuple[Phase, ...], plan: Trajectory, fraction: float | None
 ) -> list[tuple[Phase, ...]]:
     """The block with a stop in place of its release; empty if it does not begin with a release."""
@@ -377,7 +377,7 @@ def _replan_blocks(
     """
     starts, phases, scene = plan.phase_starts, list[PhaseParts](), problem.scene
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
-    blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
+    blocks = [*blocks[:-1], (*blocks[-1][:-1], _fix_end(blocks[-1][-1], plan.z[-1]))]
     for block in blocks:
         curve = runs_on_curves(block)
         margin = 0.0 if curve else fraction
@@ -406,7 +406,7 @@ def _replan_blocks(
     return []
 
 
-def _pin(phase: Phase, z: Array) -> Phase:
+def _fix_end(phase: Phase, z: Array) -> Phase:
     """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
     until, fixed = phase.until, dict(phase.until.coordinates)
     n_closed = len(phase.formation.contacts) + (until.contact is not None)

@@ -674,12 +674,12 @@ def find_help(
         for margin in phase.contacts
         if margin.margin < -tolerance and (phase.number - 1, margin.contact) not in lost
     ]
-    losses = (_examine_loss(simulation, *event) for event in events)
+    losses = (_advise_on_loss(simulation, *event) for event in events)
     approach = None if simulation.outcome.reached else find_approach(simulation)
     return results.TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
 
 
-def _examine_loss(
+def _advise_on_loss(
     simulation: Simulation, index: int, contact: str, kind: str, time: float
 ) -> results.Loss | None:
     """A loss with changes that prevent it; None if the phase does not have the contact."""
@@ -708,7 +708,7 @@ def _examine_loss(
         gradient = None if distance is None else distance[1][0]
         changes = find_resting_changes(rest, epsilon, tau, gradient)
     else:
-        response = find_moving(formation, z, v, tau, simulation.z_ddot[row])
+        response = find_moving_response(formation, z, v, tau, simulation.z_ddot[row])
         changes = () if response is None else list_changes(response, v, epsilon, contact, tau)
     forces: tuple[results.ForceAt, ...] = ()
     closing: tuple[float, ...] = ()
@@ -837,7 +837,7 @@ def find_sides(limits: LimitSet, response: modes.Response, v: Array) -> Array:
     return limits.find_slack_rows(limits.rows @ y)
 
 
-def find_moving(
+def find_moving_response(
     formation: Formation, z: Array, v: Array, tau: Array, acceleration: Array
 ) -> modes.Response | None:
     """The response in the contact mode of a motion.
