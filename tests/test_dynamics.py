@@ -36,7 +36,7 @@ from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation import complementarity
-from wholearm.verification.verify import find_uniqueness_margin, find_wedged, reduce_to_first_joint
+from wholearm.verification.verify import find_stuck, find_uniqueness_margin, reduce_to_first_joint
 
 State = tuple[Formation, Array, Array, Directions]
 """A formation, a configuration and a velocity that keep its contacts, and the signs of sliding."""
@@ -562,7 +562,7 @@ def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
     first = first / 2
     halves = (first + last) / 2, (last - first) / 2
     torque = TorqueProfile(plan.t[rows[[0, -1]]], np.stack(halves, axis=-1)[None])
-    wedged = find_wedged(problem, phase, replace(plan, torque=torque), 1e-9)
+    wedged = find_stuck(problem, phase, replace(plan, torque=torque), 1e-9)
     assert wedged is not None and 0 < wedged < duration
     for share, held in ((0.0, True), (0.97, True), (1.03, False)):
         tau = first + share * wedged / duration * (last - first)

@@ -255,14 +255,14 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     assert np.isfinite(plain).all() and (driven > 1.001 * plain).all(), (plain, driven)
     # Policies: the limit is one of torques and speeds, at both ends.
     after, point = make.make_rows(curve, s, motion), curve.evaluate(s)
-    rows = after.levels @ stack_motion(*motion)[..., None]
+    rows = after.slack @ stack_motion(*motion)[..., None]
     droop = DROOP * formation.scene.scales.torque * formation.scene.scales.time
     tau = (after.torque @ stack_motion(*motion)[..., None])[..., 0]
-    drive = tau + droop * point.z_s[:, 3:] * np.sqrt(0.5)
-    assert after.levels.shape[1] == before.levels.shape[1] + 4
+    tau = tau + droop * point.z_s[:, 3:] * np.sqrt(0.5)
+    assert after.slack.shape[1] == before.slack.shape[1] + 4
     for sign in (-1, 1):
-        for column in (1 + sign * drive / formation.scene.torque_limit).T / make.SETTINGS.spare:
-            assert np.abs(rows[..., 0] - column[:, None]).max(axis=0).min() < 1e-12
+        for line in (1 + sign * tau / formation.scene.torque_limit).T / make.SETTINGS.torque_margin:
+            assert np.abs(rows[..., 0] - line[:, None]).max(axis=0).min() < 1e-12
     # Predictions: the internal force that presses most is less free.
     forces = inverse(formation, point, directions_of(curve, np.zeros(7, int)))
     fast = np.zeros(7), np.full(7, 4.0)

@@ -317,7 +317,7 @@ def _list_misses(problem: Problem, phase: Phase, rows: Samples) -> Iterator[Miss
     for pair, gap in clearances(scene, rows.z).items():
         yield -gap.min(), OVERLAP * scales.length, f"{pair} overlap by {-gap.min():.3g} m"
     for name, flags in zip(
-        (*formation.names, "joint 1", "joint 2"), residuals.against.T, strict=True
+        (*formation.names, "joint 1", "joint 2"), residuals.wrong_sign.T, strict=True
     ):
         yield flags.sum(), 0, f"friction of {name} is not Coulomb's for its sliding"
     for text, values, limits in (

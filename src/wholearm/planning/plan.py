@@ -27,7 +27,7 @@ from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import require_phases
 from ..results.report import Certificate, RangeFigures, TimeBound, Transition, UniquenessMargin
 from ..results.trajectory import Trajectory
-from ..verification.verify import EXACT_REST, find_uniqueness_margin, find_wedged
+from ..verification.verify import EXACT_REST, find_stuck, find_uniqueness_margin
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .nlp import charge, open_ledger
@@ -253,7 +253,7 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
         # Torques may change at rest before the motion begins.
         begin = trajectory.phase_starts[phase.index]
         begin += getattr(trajectory.motions[phase.index], "begin", 0.0)
-        uniqueness.append((margin, find_wedged(problem, phase, trajectory, EXACT_REST, begin)))
+        uniqueness.append((margin, find_stuck(problem, phase, trajectory, EXACT_REST, begin)))
     return uniqueness
 
 

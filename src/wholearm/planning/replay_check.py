@@ -22,7 +22,7 @@ from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, samp
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
-from ..verification.verify import Allowance, describe_motors, find_commands, judge, observe
+from ..verification.verify import Allowance, describe_motors, find_commands, judge, replay_torques
 from .blocks import BlockPlan, Planning, plan_each
 from .phase_plan import combine
 
@@ -189,7 +189,7 @@ def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -
     """Replay of a plan, and residual of the equations of motion."""
     residual = find_residual(problem, trajectory)
     try:
-        replay = observe(problem, trajectory.torque, trajectory)
+        replay = replay_torques(problem, trajectory.torque, trajectory)
     except (JammingError, SimulationError) as error:
         return ReplayCheck(error, residual)
     return ReplayCheck(judge(replay, trajectory, allowance), residual)
@@ -257,7 +257,7 @@ def make_table(
         rows, comparison = sample_rows(trajectory.torque, rate, interpolation), None
         if replay:
             try:
-                simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
+                simulation = replay_torques(problem, TorqueProfile.join_rows(rows), trajectory)
                 comparison = _compare(trajectory, judge(simulation, None, Allowance()))
             except (JammingError, SimulationError) as error:
                 comparison = {"ok": False, "reason": str(error), "phases": []}
@@ -280,8 +280,8 @@ def _find_rows(
     if not replay:
         return rows, None
     for _ in range(_ATTEMPTS):
-        # The replay has to keep limits, and to stay near the plan.
-        simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
+        # The table has to keep the limits of the plan, and to stay near it.
+        simulation = replay_torques(problem, TorqueProfile.join_rows(rows), trajectory)
         report = judge(simulation, trajectory, Allowance())
         if report.ok or error <= least_error:
             break
