@@ -23,7 +23,7 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InputError, SolverError
 from wholearm.common.files import make_folder
-from wholearm.common.parallel import share
+from wholearm.common.parallel import run_tasks
 from wholearm.common.signals import OutOfTime, Reporter
 from wholearm.contacts.closing import close_fingers, contact_table, place_at
 from wholearm.geometry.curve import Curve
@@ -279,7 +279,7 @@ def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
         return edge_plans.plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
 
     tasks = [partial(plan, part) for part in parts]
-    for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
+    for one, other in zip(run_tasks(tasks, 1), run_tasks(tasks, 2), strict=True):
         assert isinstance(one, list) and isinstance(other, list), (one, other)
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
         for (mine, motion), (theirs, again) in zip(one, other, strict=True):

@@ -27,7 +27,7 @@ import numpy as np
 
 from .. import __version__
 from ..analysis.robustness import draw_cube
-from ..common.document import Document, Result, Table, format_csv, plain, show
+from ..common.document import Document, Result, Table, format_csv, show, to_plain
 from ..common.errors import (
     InfeasibleError,
     InputError,
@@ -395,7 +395,7 @@ def sweep(
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
     goal = PlanOptions(**chosen).goal
-    axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
+    axes = {name: tuple(to_plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
     for problem, (name, given) in product(listed[::-1], vary.items()):
         numbers = all(isinstance(value, Real) and math.isfinite(value) for value in given)
@@ -418,7 +418,7 @@ def sweep(
     stamp = {
         "study": "sweep", "version": __version__, "problems": [p.table for p in listed],
         "vary": axes, "samples": samples, "seed": seed,
-        "options": plain(planner.options), "checks": checks,
+        "options": to_plain(planner.options), "checks": checks,
     }  # fmt: skip
     with Journal(os.fspath(path or os.devnull), stamp, fresh) as journal:
         rows = {record["point"]: record["row"] for record in journal.records}

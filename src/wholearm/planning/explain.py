@@ -179,7 +179,7 @@ def find_shortfalls(
 ) -> list[Shortfall]:
     """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
     shortfalls = []
-    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least miss that counts
+    for limit, amount, worst in limits.list_violated(values, 1e-4):  # least miss that counts
         what = limit.kind, limit.part, limit.text, amount, limit.unit
         shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
     return shortfalls

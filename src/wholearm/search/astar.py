@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ..common.parallel import Task, share
+from ..common.parallel import Task, run_tasks
 from ..common.signals import Reporter, beat
 from ..contacts.elemental import Contact
 from ..geometry.tracing import CostToGo
@@ -442,7 +442,7 @@ class RoutePlanner:
         if self.jobs > 1 and not self.before and not self._bound:
             # A bound up to more than the plan will take, computed beside it.
             tasks.append(partial(bound_borders, self.search, enough))
-        results = share(tasks, self.jobs)
+        results = run_tasks(tasks, self.jobs)
         for bound in results[len(new) :]:
             self._bound = enough, bound
         known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
@@ -494,7 +494,7 @@ class RoutePlanner:
             self.report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
         plan = partial(plan_coarsely, self.free, options=self.options, thorough=self.thorough)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
-        for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
+        for edge, coarse in zip(new, run_tasks(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
         return all(plans[edge] for edge in in_cells)
 
@@ -513,9 +513,9 @@ class RoutePlanner:
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            made = share([partial(search.args[0], path, None) for path in paths], self.jobs)
+            made = run_tasks([partial(search.args[0], path, None) for path in paths], self.jobs)
             searches[edge] = partial(search, known=dict(zip(paths, made, strict=True)))
-        results = share(list(searches.values()), self.jobs)
+        results = run_tasks(list(searches.values()), self.jobs)
         for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 

@@ -38,7 +38,7 @@ from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
-from ..problem.table import PRINTED, describe_phase
+from ..problem.table import DIGITS, describe_phase
 from ..results.trajectory import ROLLS
 from ..scene.model import Scene
 from .edges import DEPENDENT, Edge, EdgeStep, describe_steps, point_out
@@ -173,7 +173,7 @@ def list_printed(
     for phase, motion in planned:
         if guesses and motion:
             phase = replace(phase, guess=_list_modes(motion, scene.scales.length))
-        phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED)))
+        phases.append(read_phase(scene, len(phases), describe_phase(phase, DIGITS)))
     return tuple(phases)
 
 

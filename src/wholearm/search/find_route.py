@@ -26,13 +26,13 @@ from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError, name_source
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
-from ..common.signals import OutOfTime, Reporter, interruptible, limited, yielding
+from ..common.signals import OutOfTime, Reporter, interrupt_at_beat, interruptible, limit_time
 from ..geometry.tracing import HELD
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
-from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
+from ..problem.table import DIGITS, describe_phase, describe_scene, write_toml
 from .astar import CAREFUL, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edge_plans import coarsen
@@ -94,7 +94,7 @@ def find_route(
         if not isinstance(number, int) or number < least:
             raise InputError("", name, f"{number!r} given; allowed is an integer from {least} up")
     plan_options = PlanOptions(objective=objective, **options)
-    with interruptible(), limited(time_limit):
+    with interruptible(), limit_time(time_limit):
         report = Reporter(progress)
         if not problem.goals:
             reason = "is missing; allowed is flush or phi_deg, and x"
@@ -153,7 +153,7 @@ def _plan_to_goal(planner: RoutePlanner, hurry: Callable[[], None] | None) -> An
     """Plan routes to one goal, with a lower bound of the best one."""
     start, complete, search, made = time.process_time(), False, planner.search, planner.made
     try:
-        with yielding():
+        with interrupt_at_beat():
             planner.report("looking for routes")
             planner.run()
         complete = True
@@ -199,7 +199,7 @@ def _plan_to_goal(planner: RoutePlanner, hurry: Callable[[], None] | None) -> An
 def _ending(hurry: Callable[[], None] | None) -> Iterator[None]:
     """Have an interrupt end what is done here alone, as far as it may, or the end of the time."""
     try:
-        with yielding():
+        with interrupt_at_beat():
             yield
     except KeyboardInterrupt as error:
         if hurry is None and not isinstance(error, OutOfTime):
@@ -368,4 +368,4 @@ class Answer(Alternative):
 
 def format_phases(problem: Problem) -> str:
     """The phases of a problem as `[[phases]]` of a problem file."""
-    return write_toml({"phases": [describe_phase(phase, PRINTED) for phase in problem.phases]})[1:]
+    return write_toml({"phases": [describe_phase(phase, DIGITS) for phase in problem.phases]})[1:]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..contacts.closing import close_fingers, describe_obstacle, name_reach
+from ..contacts.closing import close_fingers, describe_obstacle, describe_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose
@@ -141,5 +141,5 @@ def require_reach(scene: Scene, goal: Goal, near: float) -> None:
     x = goal.x + NEAR * scene.scales.length * np.array([0.0, -1.0, 1.0])
     closed = close_fingers(scene, x, np.full(3, phi))
     if (closed.obstacle > 0).any(axis=1).all():
-        why, where = describe_obstacle(closed), name_reach(scene, phi)
+        why, where = describe_obstacle(closed), describe_reach(scene, phi)
         raise InputError("", "x", f"{goal.x:g} given; {why} there; {where}")

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..common.arrays import Array, Flags, Numbers
-from ..contacts.closing import contact_table, first_contact, move, place_at
+from ..contacts.closing import contact_table, evaluate_path, first_contact, place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.path_guess import is_inside
@@ -71,7 +71,7 @@ def evaluate_paths(
 ) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
     formation, limits = _make_limits(scene, epsilon)
-    point = move(scene, labels, poses, runs)
+    point = evaluate_path(scene, labels, poses, runs)
     kinematics, rates = point.kinematics, point.z_s
     directions = Directions.of(kinematics, rates)
     # Rounding makes dependent wrenches independent by a hair (goal 12): a margin tells them.
