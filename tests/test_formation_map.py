@@ -578,7 +578,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
     until = [str(phase.until) for phase in phases]
     place = make_place(problem.scene, problem.start)
-    edges = chart.list_along(place, FAR_GOAL)
+    edges = chart.collect_edges(place, FAR_GOAL)
     (own,) = (edge for edge in edges if [str(step.until) for step in edge.steps] == until)
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
     took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
@@ -600,7 +600,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
 
 def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     problem = problem_of(HEPTAGON)
-    edges = Roadmap(problem, 0.1).list_along(make_place(problem.scene, problem.start), FAR_GOAL)
+    edges = Roadmap(problem, 0.1).collect_edges(make_place(problem.scene, problem.start), FAR_GOAL)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
     assert not any(len(own.steps) > 1 and str(own.steps[0].until) == "v3-finger1" for own in edges)
 
