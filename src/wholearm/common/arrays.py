@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]  # floating-point numbers
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-Expression = Any  # what CasADi computes with: SX, MX, DM or Function, for which it has no types
+Expression = Any  # SX, MX, DM or Function of CasADi, which has no type annotations
 
 
 _Number = TypeVar("_Number", np.float64, np.int64)

@@ -72,7 +72,7 @@ class Table(NamedTuple):
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]  # numbers, several for one cell, or text; None and NaN: a dash
     title: str = ""
-    most: int | None = None  # most rows that are rendered as text; the others are counted
+    max_rows: int | None = None  # most rows that are rendered as text; the others are counted
 
     @staticmethod
     def of(items: Iterable[Any], columns: Mapping[str, str], title: str = "") -> Table:
@@ -103,12 +103,12 @@ class Table(NamedTuple):
 
     def to_text(self) -> str:
         """Aligned columns under their names."""
-        formats, lines = self.formats, [self.heads, *self.cells[: self.most]]
+        formats, lines = self.formats, [self.heads, *self.cells[: self.max_rows]]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         aligned = [f"{'>' if f else '<'}{width}" for f, width in zip(formats, widths, strict=True)]
         text = [self.title] if self.title else []
         text += ["  ".join(map(format, line, aligned)).rstrip() for line in lines]
-        n_hidden = len(self.rows) - len(self.rows[: self.most])
+        n_hidden = len(self.rows) - len(self.rows[: self.max_rows])
         return "\n".join([*text, *([f"... and {n_hidden} more, see --json"] if n_hidden else [])])
 
     def to_html(self) -> str:

@@ -40,40 +40,40 @@ class Range:
     low: float  # low, high: as multiples of the scale, if there is one
     high: float
     scale: Callable[[Any, Any], float | None] | None = None  # of scene and owner; None: no range
-    scale_name: str = ""  # what messages call the scale; ``{time}`` stands for the scene's time
+    scale_name: str = ""  # the scale in messages; ``{time}`` is replaced by the scene's time
 
     @property
-    def whole(self) -> bool:
+    def is_integer(self) -> bool:
         """Whether only whole numbers are allowed."""
         return isinstance(self.low, int)
 
     def describe(self, time: str = "the scene's time") -> str:
         """The range in words."""
-        low, high = (f"{end}" if self.whole else f"{end:g}" for end in (self.low, self.high))
-        text = f"{'whole numbers from ' if self.whole else ''}{low} to {high}"
+        low, high = (f"{end}" if self.is_integer else f"{end:g}" for end in (self.low, self.high))
+        text = f"{'whole numbers from ' if self.is_integer else ''}{low} to {high}"
         return f"{text} {self.scale_name.format(time=time)}".rstrip()
 
     def find_fault(self, value: object) -> str:
         """Message about a value that is not allowed; empty if it is allowed."""
-        kinds = (int,) if self.whole else (int, float)
+        kinds = (int,) if self.is_integer else (int, float)
         is_number = isinstance(value, kinds) and not isinstance(value, bool)
         if is_number and self.low <= value <= self.high:  # type: ignore[operator]
             return ""
         return f"{value!r} given; allowed are {self.describe()}"
 
-    def read(self, given: Any, key: str) -> Any:
+    def read(self, raw: Any, key: str) -> Any:
         """The value as int or float, or an `InputError` that names `key`."""
         # NumPy integers are not instances of int.
-        value = given.item() if isinstance(given, Real) and hasattr(given, "item") else given
+        value = raw.item() if isinstance(raw, Real) and hasattr(raw, "item") else raw
         if text := self.find_fault(value):
             raise InputError("", key, text)
-        return value if self.whole else float(value)
+        return value if self.is_integer else float(value)
 
     def parse(self, text: str) -> Any:
         """The value of a command-line option."""
         value: Any = text
         with suppress(ValueError):
-            value = int(text) if self.whole else float(text)
+            value = int(text) if self.is_integer else float(text)
         if fault := self.find_fault(value):
             raise argparse.ArgumentTypeError(fault)
         return value

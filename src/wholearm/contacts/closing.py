@@ -138,12 +138,12 @@ def _close_finger(
     angle, feature = _touch(link, finger, dx, dy)
     obstacle = np.where(feature < 0, TOO_SHORT, 0)
     # Unless the object is above the joint, it may overlap the link where that hangs down.
-    beside = np.flatnonzero(dy.min(axis=0) <= link.radius)
-    if len(beside):
-        z_down = np.full((len(beside), 5), -np.pi / 2)
-        z_down[:, :3] = np.column_stack([x, y, phi])[beside]
+    rows = np.flatnonzero(dy.min(axis=0) <= link.radius)
+    if len(rows):
+        z_down = np.full((len(rows), 5), -np.pi / 2)
+        z_down[:, :3] = np.column_stack([x, y, phi])[rows]
         covered = measure_gaps(scene, z_down)[:, 1 + finger] < 1e-12 * link.length
-        obstacle[beside[covered]] = JOINT_COVERED
+        obstacle[rows[covered]] = JOINT_COVERED
     return angle, feature, obstacle
 
 
@@ -253,8 +253,8 @@ def describe_reach(scene: Scene, phi: float) -> str:
     x = np.linspace(low, max(low, high), 1000)
     feasible = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
     spans = []
-    for run in find_runs(feasible, min_length=2):
-        first, last = float(x[run.start]), float(x[run.stop - 1])
+    for interval in find_runs(feasible, min_length=2):
+        first, last = float(x[interval.start]), float(x[interval.stop - 1])
         # Rounded inwards to few digits.
         digits = 2 - math.floor(math.log10(last - first))
         step = 10.0**-digits

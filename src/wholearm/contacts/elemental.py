@@ -49,8 +49,8 @@ class Contact:
 
     feature: str  # {"v", "e"}: a vertex or an edge of the object
     index: int  # which vertex or edge
-    # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link; of what only
-    # stops a motion {"back", "joint"}: the far side of a link or the circle about its joint
+    # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link; as obstacles
+    # only {"back", "joint"}: the far side of a link or the circle about its joint
     surface: str
     finger: int | None = None  # 0 for finger 1, 1 for finger 2, None for the palm
 
@@ -161,13 +161,13 @@ def build_features(scene: Scene) -> Features:
 def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:
     """Object and hand from corners, (2, n_v), and base, length and radius of each link [m]."""
     z, count = _Z, corners.shape[1]
-    run = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
-    lengths = ca.hypot(run[0, :], run[1, :])
+    along = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
+    lengths = ca.hypot(along[0, :], along[1, :])
     c, s = ca.cos(z[2]), ca.sin(z[2])
     rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
     vertices = rotation @ corners + ca.repmat(z[:2], 1, count)
     x, y = corners[0, :], corners[1, :]
-    units = run / ca.repmat(lengths, 2, 1)
+    units = along / ca.repmat(lengths, 2, 1)
     # Products with the vertices do not depend on the pose.
     starts, depths = units[0, :] * x + units[1, :] * y, units[0, :] * y - units[1, :] * x
     units = rotation @ units
@@ -180,22 +180,22 @@ def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -
         axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
         link = Link(base, base + length * axis, axis, side * rotate_quarter(axis), length, radius)
         bodies.append(link)
-        away = vertices - ca.repmat(base, 1, count)
-        run, heights = axis.T @ away, link.normal.T @ away
-        ranges_on_link = run, length - run
+        r = vertices - ca.repmat(base, 1, count)
+        along, heights = axis.T @ r, link.normal.T @ r
+        ranges_on_link = along, length - along
         sides = {
-            "v finger": (heights - radius, side * run, *ranges_on_link),
-            "v back": (-heights - radius, -side * run, *ranges_on_link),
+            "v finger": (heights - radius, side * along, *ranges_on_link),
+            "v back": (-heights - radius, -side * along, *ranges_on_link),
         }
         kinds.append((finger, sides))
         for surface, centre, out in (("tip", link.tip, axis), ("joint", base, -axis)):
-            place, away = centre - z[:2], vertices - ca.repmat(centre, 1, count)
-            run, depth = place.T @ units - starts, place.T @ normals - depths
-            remaining = lengths - run
-            edges = -depth - radius, -run - radius * (z[2] - theta), run, remaining
-            axial, angle = out.T @ away, ca.atan2(rotate_quarter(out).T @ away, out.T @ away)
+            place, r = centre - z[:2], vertices - ca.repmat(centre, 1, count)
+            along, depth = place.T @ units - starts, place.T @ normals - depths
+            remaining = lengths - along
+            edges = -depth - radius, -along - radius * (z[2] - theta), along, remaining
+            axial, angle = out.T @ r, ca.atan2(rotate_quarter(out).T @ r, out.T @ r)
             before_range = -ca.horzcat(remaining[-1], remaining[:-1])
-            arcs = ca.sqrt(ca.sum1(away**2)) - radius, -radius * angle, axial, before_range, -run
+            arcs = ca.sqrt(ca.sum1(r**2)) - radius, -radius * angle, axial, before_range, -along
             kinds.append((finger, {f"e {surface}": edges, f"v {surface}": arcs}))
     pairs = {}
     for owner, rows in kinds:

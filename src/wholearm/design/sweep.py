@@ -298,7 +298,7 @@ class Sweep(Result):
         if best is not None:
             place = [f"{name} = {show(self.rows[best][name], '.6g')}" for name in names]
             last = ", ".join([f"best: {self.label} = {self.rows[best]['value']:.6g}", *place])
-        table = Table([*columns.values()], rows, most=100)
+        table = Table([*columns.values()], rows, max_rows=100)
         causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
         reason = f"{len(rows) - sum(reasons.values())} of {len(rows)} points planned"
         return Document(", ".join(self.problems), reason=reason, parts=[table, causes, last])

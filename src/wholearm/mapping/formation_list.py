@@ -526,8 +526,8 @@ def write_template(
         angles = -math.pi / 2 + math.pi * (2 * np.arange(polygon) - 1) / polygon
         # Rounded, so that a corner above the centroid has x = 0.
         vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
-    few = polygon < 5
-    defaults = 0.05, few, 1.2 if few else 0.3
+    few_corners = polygon < 5
+    defaults = 0.05, few_corners, 1.2 if few_corners else 0.3
     if not custom:
         return _write(name, vertices, size, weight, *defaults)
     # For `vertices`, combinations of friction, hand and start are tested.

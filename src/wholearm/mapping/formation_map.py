@@ -82,7 +82,7 @@ class FormationMap(Drawn):
     borders: tuple[Border, ...]
     crossings: tuple[Crossing, ...]
     places: Array  # (m, 2) [m, rad]: at which directions inside cells were checked
-    possible: Flags  # (m, 4): whether quasistatic motions in the directions `WAYS` are feasible
+    possible: Flags  # (m, 4): whether quasistatic motions in the `DIRECTIONS` are feasible
     ambiguous: Flags  # (m,): one more would be, but contact forces are not unique
 
     @property

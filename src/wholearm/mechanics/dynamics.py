@@ -184,8 +184,8 @@ def find_freedoms(P: Array, metric: Array, tolerance: float) -> Array:
     Singular values up to `tolerance` times the largest one count as zero.
     """
     root = np.sqrt(metric)
-    _, values, right = np.linalg.svd(P / root)
-    return np.asarray(right[int((values > tolerance * values[0]).sum()) :].T / root[:, None])
+    _, values, vectors = np.linalg.svd(P / root)
+    return np.asarray(vectors[int((values > tolerance * values[0]).sum()) :].T / root[:, None])
 
 
 def measure_speed(scene: Scene, v: Array) -> float:

@@ -177,14 +177,14 @@ class Sensitivity(NamedTuple):
             return kinematics
         shift = np.zeros(5)
         shift["xy".index(name[-1])] = change
-        moved = formation.evaluate(z - shift, v)
+        shifted_back = formation.evaluate(z - shift, v)
         flags, count = self._finger_rows(name), formation.n_contacts
 
         def choose(fixed: Array, shifted: Array) -> Array:
             rows = flags[:count] if fixed.shape[1] == count else flags
             return np.where(rows.reshape(-1, *[1] * (fixed.ndim - 2)), shifted, fixed)
 
-        return Kinematics(*map(choose, kinematics, moved))
+        return Kinematics(*map(choose, kinematics, shifted_back))
 
 
 @lru_cache(maxsize=16)  # building the functions of a formation takes longer than evaluating them

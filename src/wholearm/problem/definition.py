@@ -305,7 +305,7 @@ class Problem:
         **named
             Keys of a problem file: those at the top, of the object, of the start, of both fingers
             or of one as in `torque_limit1`; `finger_inertia`; `friction` of all parts or of one as
-            in `friction_palm`. None leaves out what is optional.
+            in `friction_palm`. None removes an optional value.
 
         Raises
         ------

@@ -206,11 +206,11 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     write_text(path, write_toml(problem.table))
 
 
-def write_toml(table: Mapping[str, Any], where: str = "") -> str:
+def write_toml(table: Mapping[str, Any], prefix: str = "") -> str:
     """Nested tables as TOML: values first, then tables, then lists of tables."""
     values, tables = [], []
     for key, value in table.items():
-        full_key = f"{where}{_quote(key)}"
+        full_key = f"{prefix}{_quote(key)}"
         if isinstance(value, Mapping):
             tables.append(f"\n[{full_key}]\n{write_toml(value, f'{full_key}.')}")
         elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
