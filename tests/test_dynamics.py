@@ -222,16 +222,16 @@ def test_each_body_takes_its_impulses_as_complementarity_says() -> None:
                 assert (parting > 0.1).all()
             else:
                 # What would have to pull is let go.
-                assert rates[after.names.index(impact.least[0])] > 0.01
+                assert rates[after.names.index(impact.least_impulse[0])] > 0.01
                 assert not np.allclose(collision.v, impact.v, atol=0.1)
 
 
 def test_what_would_have_to_pull_is_named() -> None:
     tipping = chain_of(HEPTAGON)
     impact = tipping.impacts[0].impact
-    assert impact.least == ("v1-palm", float(impact.p[1]))
+    assert impact.least_impulse == ("v1-palm", float(impact.p[1]))
     first = impact.violations[0]
-    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least)
+    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least_impulse)
     assert tipping.impacts[0].reason == "impulse on v1-palm would be -0.0414 N s per m/s"
     assert first.describe() == "impulse on v1-palm would be -0.0414 N s"
 
@@ -289,7 +289,7 @@ def test_a_corner_dropped_on_the_palm(friction: float, slide: float) -> None:
     fall = v[1] + r[0] * v[2]
     p = -fall / (1 / MASS + r[0] * (r[0] + friction * way * r[1]) / inertia)
     assert p > 0 and impact.possible
-    assert impact.least[0] == "v1-palm" and impact.least[1] == pytest.approx(p)
+    assert impact.least_impulse[0] == "v1-palm" and impact.least_impulse[1] == pytest.approx(p)
     spin = v[2] + (r[0] * p + r[1] * friction * way * p) / inertia
     expected = [v[0] - friction * way * p / MASS, v[1] + p / MASS, spin, 0.0, 0.0]
     np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)

@@ -722,7 +722,7 @@ def test_html_has_the_same_cells_and_names_escaped() -> None:
 
 
 def test_long_tables_are_cut_as_text_and_have_a_rule_as_markdown() -> None:
-    table = Table(["n:d", "a:b:.1f", "word"], [(k, k / 2, "w") for k in range(5)], most=2)
+    table = Table(["n:d", "a:b:.1f", "word"], [(k, k / 2, "w") for k in range(5)], max_rows=2)
     text = table.to_text().splitlines()
     assert text[0].split() == ["n", "a:b", "word"] and len(text) == 4
     assert text[-1] == "... and 3 more, see --json"

@@ -28,7 +28,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan, Plans
 from wholearm.planning.replay_check import make_table
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
-from wholearm.problem.read import build_problem, read_own_problem
+from wholearm.problem.read import build_problem, read_stored_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
@@ -427,7 +427,7 @@ def test_torques_are_held_from_period_to_period(hold: str, tmp_path: Path) -> No
     plan.save(path)
     known = load_plan(path)
     assert known.phases[0].unheld == free
-    scene = read_own_problem(known.trajectory.meta, path).scene
+    scene = read_stored_problem(known.trajectory.meta, path).scene
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
 
 

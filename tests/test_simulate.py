@@ -362,7 +362,7 @@ def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
     def fall(x: float) -> float:
         return 1e-6 * math.copysign(abs(root - x) ** power, root - x)
 
-    found = find_root(fall, 0.0, 1.0, near=1e-12)
+    found = find_root(fall, 0.0, 1.0, x_tolerance=1e-12)
     # The bracket is at most 1e-12 wide at the end.
     assert found == pytest.approx(root, abs=1e-12)
 

@@ -569,7 +569,7 @@ def test_velocities_jump_by_the_impact_law(objective: str, over_time: bool) -> N
         assert np.sqrt(metric @ v_next**2) == pytest.approx(row["velocity_ratio"] * speed, rel=1e-5)
         impact = compute_impact(before, after, z, v)
         np.testing.assert_allclose(v_next, impact.v, rtol=0, atol=close)
-        assert impact.least[0] == row["least_impulse_contact"]
+        assert impact.least_impulse[0] == row["least_impulse_contact"]
         # The contacts of the next formation neither part nor press into one another.
         assert np.abs(measure_gaps(after, z)).max() < 1e-8
         assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < close

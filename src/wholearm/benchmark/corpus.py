@@ -32,7 +32,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..common.document import Table, plain
+from ..common.document import Table, to_plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import check_phases, trace_phases
 from ..planning.nlp import open_ledger
@@ -109,7 +109,7 @@ def answer(case: Case, folder: Path) -> Row:
         row = FAMILIES[family][0](folder, *arguments)
     except wholearm.WholearmError as error:
         row = _refuse(error)
-    text = json.dumps(plain(row))
+    text = json.dumps(to_plain(row))
     return dict(json.loads(text, parse_float=lambda digits: float(f"{float(digits):.9g}")))
 
 

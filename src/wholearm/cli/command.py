@@ -36,7 +36,7 @@ from ..common.errors import (
 )
 from ..common.fields import Range, choice, keys_of, read_options
 from ..common.files import READ, number_same, require_ending, require_writable, together, write_text
-from ..common.signals import listen, on_end
+from ..common.signals import listen, register_cleanup
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
 
@@ -442,7 +442,7 @@ def clear_progress() -> None:
         show_progress("")
 
 
-on_end(clear_progress)
+register_cleanup(clear_progress)
 
 
 def require_output(path: str | None, *endings: str) -> None:
@@ -661,9 +661,9 @@ def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.
     """Simulation of the torques of a trajectory by a simulator, told or free; None without one."""
     if simulator is None:
         return None
-    from ..problem.read import read_own_problem
+    from ..problem.read import read_stored_problem
 
-    problem = read_own_problem(trajectory.meta)
+    problem = read_stored_problem(trajectory.meta)
     if simulator == "free":
         show_progress("simulating the whole")
         free = wholearm.simulate_free(problem, trajectory, times=trajectory.t)
@@ -708,7 +708,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _robustness(options: argparse.Namespace) -> int:
-    from ..problem.definition import spread_widths
+    from ..problem.definition import expand_widths
 
     # Studies of other problems, phases and policies have other files.
     parts = [Path(options.problem).stem, "robustness"]
@@ -730,7 +730,7 @@ def _robustness(options: argparse.Namespace) -> int:
         except ValueError:
             fault = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1, and each name once"
             raise InputError("", "--vary", fault) from None
-    ranges = problem.ranges | spread_widths(widths, "--vary {}")
+    ranges = problem.ranges | expand_widths(widths, "--vary {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
     trials = wholearm.Uncertainty(ranges, options.sample_rate or None, options.tolerance, *goal)
     study = wholearm.assess_robustness(
@@ -888,13 +888,13 @@ def _replay(options: argparse.Namespace) -> int:
 def _policy(options: argparse.Namespace) -> int:
     from ..planning.plan import plan_anew
     from ..policy.make import find_largest_factors
-    from ..problem.read import read_own_problem
+    from ..problem.read import read_stored_problem
     from ..verification.free import CONTACT_SPEEDS, find_policy
 
     output = options.output or f"{Path(options.plan).stem}_policy.npz"
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
-    problem = read_own_problem(plan.meta, options.plan)
+    problem = read_stored_problem(plan.meta, options.plan)
     planner = partial(plan_anew, progress=show_progress)
     names = "reserve", "period", "delay", "torque_limit", "contact_speed", "departure"
     values = list_given(options, *names) | {"planner": planner}
@@ -1031,12 +1031,12 @@ def _gallery(options: argparse.Namespace) -> int:
 
 
 def _animate(options: argparse.Namespace) -> int:
-    from ..problem.read import read_own_problem
+    from ..problem.read import read_stored_problem
 
     require_output(options.output, ".gif", ".mp4", ".html")
     trajectory = wholearm.load_trajectory(options.trajectory)
     with name_source(options.trajectory):
-        problem = read_own_problem(trajectory.meta)
+        problem = read_stored_problem(trajectory.meta)
         simulation = overlay(options.simulate, trajectory)
         ghost = None if simulation is None else simulation.trajectory
         if options.output.lower().endswith(".html"):

@@ -24,7 +24,7 @@ from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InfeasibleError, InputError
 from ..common.fields import Range, choice
-from ..common.parallel import share
+from ..common.parallel import run_tasks
 from ..common.sharing import exclusive
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import UNITS, Plan
@@ -263,7 +263,7 @@ def design_hand(
     keys = tuple(key for c in choices for key in c.factors)
     aim = HandCost(choices, Planner(listed, keys, chosen), today, factors / factors.sum(), worst)
     tasks = [partial(aim.search, start, budget, progress) for start in range(1, starts + 1)]
-    hands = tuple(hand for searched in share(tasks, jobs) for hand in searched)
+    hands = tuple(hand for searched in run_tasks(tasks, jobs) for hand in searched)
     feasible = [hand for hand in hands if not hand.reason]
     if not feasible:
         reason, count = Counter(hand.reason for hand in hands).most_common(1)[0]

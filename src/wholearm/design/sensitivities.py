@@ -25,7 +25,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, SolverError, WholearmError
-from ..common.parallel import share
+from ..common.parallel import run_tasks
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase, trace_phases
@@ -343,7 +343,7 @@ def find_sensitivities(
     methods.append(("differences", WIDE_STEP, list_values(planning), solve))
     progress(f"{len(parameters)} numbers")
     tasks = [partial(_find_one, problem, goal, parts, methods, p) for p in parameters]
-    rows = share(tasks, jobs)
+    rows = run_tasks(tasks, jobs)
     rows.sort(key=lambda row: -abs(row.percent) if math.isfinite(row.percent) else 0.0)
     value = combine(goal, [plan.value for plan in planning.plans])
     return Sensitivities(problem.name, goal.value, value, UNITS[goal], parts, tuple(rows))

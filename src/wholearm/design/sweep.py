@@ -27,7 +27,7 @@ import numpy as np
 
 from .. import __version__
 from ..analysis.robustness import draw_cube
-from ..common.document import Document, Result, Table, format_csv, plain, show
+from ..common.document import Document, Result, Table, format_csv, show, to_plain
 from ..common.errors import (
     InfeasibleError,
     InputError,
@@ -298,7 +298,7 @@ class Sweep(Result):
         if best is not None:
             place = [f"{name} = {show(self.rows[best][name], '.6g')}" for name in names]
             summary = ", ".join([f"best: {self.label} = {self.rows[best]['value']:.6g}", *place])
-        table = Table([*columns.values()], rows, most=100)
+        table = Table([*columns.values()], rows, max_rows=100)
         causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
         reason = f"{len(rows) - sum(reasons.values())} of {len(rows)} points planned"
         return Document(", ".join(self.problems), reason=reason, parts=[table, causes, summary])
@@ -395,7 +395,7 @@ def sweep(
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
     goal = PlanOptions(**chosen).goal
-    axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
+    axes = {name: tuple(to_plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
     for problem, (name, candidates) in product(listed[::-1], vary.items()):
         numbers = all(isinstance(value, Real) and math.isfinite(value) for value in candidates)
@@ -418,7 +418,7 @@ def sweep(
     stamp = {
         "study": "sweep", "version": __version__, "problems": [p.table for p in listed],
         "vary": axes, "samples": samples, "seed": seed,
-        "options": plain(planner.options), "checks": checks,
+        "options": to_plain(planner.options), "checks": checks,
     }  # fmt: skip
     with Journal(os.fspath(path or os.devnull), stamp, fresh) as journal:
         rows = {record["point"]: record["row"] for record in journal.records}

@@ -35,14 +35,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Flags, Independent, Numbers, find_runs, sort_unique
+from ..common.arrays import Array, Flags, IndependentRows, Numbers, find_runs, sort_unique
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, WholearmError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
-from ..problem.read import read_own_problem
+from ..problem.read import read_stored_problem
 from ..results.adopt import MotionLike, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Samples, Trajectory
@@ -295,7 +295,7 @@ def find_reference(plan: Trajectory) -> Trajectory:
     starts = plan.phase_starts
     times = np.linspace(starts[:-1], starts[1:], 400)
     try:
-        problem = read_own_problem(plan.meta)
+        problem = read_stored_problem(plan.meta)
         replay = simulate(problem, plan.torque, times=times.ravel()).trajectory
     except WholearmError:
         return plan
@@ -325,7 +325,7 @@ def penetrate_start(
     A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     weight = 1 / np.sqrt(scene.mass_diagonal)
     # Other contacts only if independent: rows of contacts at one place are equal but for rounding.
-    independent, count = Independent(0.1), formation.n_contacts
+    independent, count = IndependentRows(0.1), formation.n_contacts
     rows = [k for k, row in enumerate(A * weight) if independent.add(row) or k < count]
     depth = scene.scales.length * np.where(np.arange(len(contacts)) < count, 1e-6, -3e-7)
     if stiffness is not None:

@@ -190,7 +190,7 @@ class _Drawing:
 
         def cut(borders: Sequence[Array], name: str) -> Iterator[Array]:
             for border, points in zip(flush, borders, strict=True):
-                yield from (points[run] for run in find_runs(getattr(border, name), least=2))
+                yield from (points[run] for run in find_runs(getattr(border, name), min_length=2))
 
         for colour, sign, name in ((_FORTH, 1.0, "forth"), (_BACK, -1.0, "back")):
             # 2.6 points beside the border.

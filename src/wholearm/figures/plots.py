@@ -30,7 +30,7 @@ from ..common.errors import InputError, require_number
 from ..common.files import require_ending, write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
-from ..problem.read import read_own_problem
+from ..problem.read import read_stored_problem
 from ..results.adopt import Torques, split_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
@@ -467,7 +467,7 @@ def force_margins(
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
     width = style.WIDTHS.read(width, "width")
     meta = trajectory.meta
-    problem = read_own_problem(meta)
+    problem = read_stored_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
     scene, styles = problem.scene, style.choose_styles(trajectory.contacts)
     parts = [textwrap.shorten(str(meta.get("name", "")), 36, placeholder="\u2026")]

@@ -179,7 +179,7 @@ def find_shortfalls(
 ) -> list[Shortfall]:
     """Largest violation of each limit and its place, from values of the rows, (n, m)."""
     shortfalls = []
-    for limit, amount, k in limits.list_misses(values, 1e-4):  # least violation that counts
+    for limit, amount, k in limits.list_violated(values, 1e-4):  # least violation that counts
         kind, part, share = limit.kind, limit.part, amount / limit.scale
         shortfalls.append(Shortfall(kind, part, limit.text, amount, limit.unit, places[k], share))
     return shortfalls

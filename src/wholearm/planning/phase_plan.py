@@ -11,7 +11,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.document import plain
+from ..common.document import to_plain
 from ..common.errors import Change, InfeasibleError, Parameter, describe_changes, round_outwards
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curves
@@ -74,7 +74,7 @@ def assemble_motions(pieces: Iterable[Piece], rows: int, **meta: Any) -> Traject
     motions, torques, formations = zip(*pieces, strict=True)
     entries: dict[str, Any] = {
         "rolling": [[contact.name for contact in formation.rolling] for formation in formations],
-        "modes": plain([getattr(motion, "modes", ()) for motion in motions]),
+        "modes": to_plain([getattr(motion, "modes", ()) for motion in motions]),
     }
     return assemble(motions, TorqueProfile.chain(torques), entries | meta, rows)
 
@@ -148,6 +148,6 @@ def make_transition(
     phase: Phase, impact: Impact, ratio: float, reason: str, speed: float
 ) -> Transition:
     """The transition at the end of a phase, with unknown savings."""
-    contact, impulse = impact.least
+    contact, impulse = impact.least_impulse
     until, nan = str(phase.until), math.nan
     return Transition(phase.number, until, not reason, reason, ratio, impulse, contact, speed, nan)

@@ -17,7 +17,7 @@ from .. import __version__
 from ..common.arrays import Array
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.sharing import exclusive
-from ..common.signals import OutOfTime, Reporter, interruptible, limited
+from ..common.signals import OutOfTime, Reporter, interruptible, limit_time
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import measure_speed
@@ -95,7 +95,7 @@ def solve_with(
     require_phases(problem)
     report = Reporter(progress)
     try:
-        with interruptible(), limited(time_limit):
+        with interruptible(), limit_time(time_limit):
             return _solve(problem, options, report)
     except OutOfTime:
         if time_limit is None:

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, get_type_hints
 
 from numpy.typing import ArrayLike
 
-from ..common.document import Document, Drawn, Result, Table, fixed, plain, restore
+from ..common.document import Document, Drawn, Result, Table, fixed, restore, to_plain
 from ..common.errors import InputError, name_source
 from ..problem.definition import PARAMETERS, Problem
-from ..problem.read import read_own_problem
+from ..problem.read import read_stored_problem
 from ..results.dwell_record import Settling
 from ..results.planned_motion import PlannedMotion
 from ..results.report import Certificate, RangeFigures, ReplayFigures, Transition, UniquenessMargin
@@ -177,7 +177,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
     phases, options = plan.phases, plan.options
     of_phases = {name: [getattr(phase, name) for phase in phases] for name in _PHASES}
     costs = {name: [getattr(each.statistics, name) for each in phases] for name in _STATISTICS}
-    values: dict[str, Any] = plain(
+    values: dict[str, Any] = to_plain(
         {
             "status": plan.status,
             "name": plan.problem.name,
@@ -203,7 +203,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     trajectory = load_trajectory(path)
     source = str(path)
-    problem = read_own_problem(trajectory.meta, source)
+    problem = read_stored_problem(trajectory.meta, source)
     try:
         with name_source(source, "meta."):
             return _read(trajectory, problem)

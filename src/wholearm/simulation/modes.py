@@ -46,7 +46,7 @@ from ..common.arrays import Array, Flags, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import close_all, find_freedoms, move_least
+from ..mechanics.dynamics import close_all, find_freedoms, solve_min_norm
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
@@ -345,7 +345,7 @@ class Rest:
         if still.any():
             # What is stationary here has the direction that it has just after.
             at = formation.evaluate(self.z[None], heading[None])
-            bend = -move_least(at.P, at.P_dot_v, formation.scene.mass_diagonal)[0]
+            bend = -solve_min_norm(at.P, at.P_dot_v, formation.scene.mass_diagonal)[0]
             rows = evaluate_rows(formation, self.z, heading)
             ahead = rows.A_t @ bend + rows.bend_t
             moves = np.abs(ahead) > 1e-7 * fastest * scale

@@ -637,7 +637,7 @@ class Replay(Run):
         """Plastic impact onto the next formation; the outcome if it is not possible."""
         z = self._close(following.formation)
         impact = compute_impact(self.formation, following.formation, z, self.v)
-        name, least = impact.least
+        name, least = impact.least_impulse
         names = following.formation.names
         normal = impact.p[: len(names)]
         impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))

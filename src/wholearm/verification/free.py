@@ -465,8 +465,8 @@ class FreeReport(Result):
                 *(f"warning: {text}" for text in self.warnings),
                 _list_phases(self.alone, "each phase from its planned start"),
                 _list_phases(self.phases, title),
-                Table.of(whole.stretches, columns)._replace(most=MAX_EVENTS),
-                Table(["at t [s]:.6f", "phase:d", "event"], events, most=MAX_EVENTS),
+                Table.of(whole.stretches, columns)._replace(max_rows=MAX_EVENTS),
+                Table(["at t [s]:.6f", "phase:d", "event"], events, max_rows=MAX_EVENTS),
                 f"residual of the contact problems {whole.residual:.1e}, of the energy "
                 f"{abs(whole.energies.residual).max():.1e} J; {whole.outcome.text}",
             ],

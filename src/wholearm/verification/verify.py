@@ -379,7 +379,7 @@ def describe_excess(
     return [
         f"{limit.text} is exceeded by {amount:.3g} {limit.unit} at t = {t[worst]:.5g} s, phase "
         f"{phase.number}"
-        for limit, amount, worst in limits.list_misses(y @ limits.rows.T, allowed)
+        for limit, amount, worst in limits.list_violated(y @ limits.rows.T, allowed)
     ]
 
 

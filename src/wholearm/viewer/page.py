@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array, Numbers, find_runs
-from ..common.document import plain
+from ..common.document import to_plain
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
@@ -73,7 +73,7 @@ def describe_motion(
                 "normal": round_z(touch.normal[run, :2], scene),
                 "c": _round(c[run]),
             }
-            for run in find_runs(np.isfinite(c).all(axis=1), least=2)
+            for run in find_runs(np.isfinite(c).all(axis=1), min_length=2)
         ]
         dashes = [] if styles[name].line == "-" else list(styles[name].line[1])
         look = {"name": name, "colour": styles[name].colour, "dashes": dashes}
@@ -130,4 +130,4 @@ def round_z(values: Array, scene: Scene) -> Any:
 
 def _round(values: Array) -> Any:
     """Nested lists of numbers with six digits, None where there is no number."""
-    return plain(np.reshape([float(f"{v:.6g}") for v in values.ravel().tolist()], values.shape))
+    return to_plain(np.reshape([float(f"{v:.6g}") for v in values.ravel().tolist()], values.shape))

@@ -684,7 +684,7 @@ class LimitShape(NamedTuple):
         rows, signs, _ = limits.sides
         # What depends on torques or speeds of the joints.
         joints = limits.rows[:, -4:].any(axis=1)
-        drags = np.array([limits.limits[k].drags for k in limits.owners])
+        drags = np.array([limits.limits[k].viscous for k in limits.owners])
         return LimitShape(
             len(limits.low),
             tuple(zip(rows.tolist(), signs.tolist(), strict=True)),

@@ -129,7 +129,7 @@ def repeat_limits(limits: LimitSet) -> LimitSet:
         changes: dict[str, Any] = {"rows": rows}
         if limit.kind in (PRESS, CONE):
             count, begin = len(rows) * COPIES, forces.shape[1] + first
-            changes = {"rows": np.eye(rows.shape[1])[begin : begin + count], "drags": True}
+            changes = {"rows": np.eye(rows.shape[1])[begin : begin + count], "viscous": True}
             vectors = ("low", "high", "weight")
             changes |= {name: np.repeat(getattr(limit, name), COPIES) for name in vectors}
             changes["text"] = f"{limit.text} within all ranges,"

@@ -13,7 +13,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
-from ...mechanics.dynamics import Directions, forward, metric_weights, move_least, split_forces
+from ...mechanics.dynamics import Directions, forward, metric_weights, solve_min_norm, split_forces
 from ...results.torque import TorqueProfile
 from ...results.trajectory import ROLLS, ModeSpan, Samples
 from .stage import Scheme, Stage, StagePoints, bernstein
@@ -129,9 +129,9 @@ class StageMotion:
         for _ in range(3):
             kinematics = formation.evaluate(z, v)
             gaps = np.hstack([kinematics.C, formation.evaluate_slip(z) - self.slip])
-            z = z - move_least(kinematics.P, gaps, metric)
+            z = z - solve_min_norm(kinematics.P, gaps, metric)
         kinematics = formation.evaluate(z, v)
-        v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
+        v = v - solve_min_norm(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
         a, c = forward(formation, formation.evaluate(z, v), v, tau, self.directions)
         return Samples(z, v, a, tau, *split_forces(formation, c, self.directions.Xi))
