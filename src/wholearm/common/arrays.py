@@ -84,12 +84,22 @@ def round_to(value: float, unit: float) -> float:
 
 
 def find_minima(values: Array) -> Array:
-    """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
+    """Least value along the middle axis of evenly spaced values, also between them.
+
+    Slope and curvature at a least value are those of a parabola through three values, or, where
+    there are five, of fourth order. Case: least effort of a box (test), whose torque is 2.6e-6 of
+    its limit above that where parabolas see 2.4e-7.
+    """
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
-    bend = before - 2 * here + after
+    slope, bend = (after - before) / 2, before - 2 * here + after
     inside = (here <= before) & (here <= after) & (bend > 0)
-    dip = np.divide((after - before) ** 2, 8 * bend, out=np.zeros_like(here), where=inside)
-    return np.asarray(np.minimum((here - dip).min(axis=1), values[:, [0, -1]].min(axis=1)))
+    far = values[:, 4:], values[:, :-4]
+    slope[:, 1:-1] = (8 * slope[:, 1:-1] - (far[0] - far[1]) / 2) / 6
+    fourth = (16 * bend[:, 1:-1] - far[0] - far[1] + 2 * here[:, 1:-1]) / 12
+    bend[:, 1:-1] = np.where(fourth > 0, fourth, bend[:, 1:-1])
+    shift = np.divide(-slope, bend, out=np.zeros_like(here), where=inside).clip(-1, 1)
+    dip = shift * (slope + bend * shift / 2)
+    return np.asarray(np.minimum((here + dip).min(axis=1), values[:, [0, -1]].min(axis=1)))
 
 
 def find_lowest(t: Array, values: Array, shortest: float = 0.0) -> tuple[float, float]:
