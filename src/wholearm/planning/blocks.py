@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -46,6 +47,7 @@ from .phase_plan import (
     share_duration,
 )
 
+LONG = 4.0  # ratio of a longest duration to the least time above which shorter ones are tried
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -121,12 +123,25 @@ def plan_blocks(
     planning = Planning(problem, curves, options, ())
     if options.goal is not Objective.MARGIN:
         return plan_each(planning, report)
+    from .explain import unadvised
+
     fast = replace(options, objective=Objective.TIME, duration=None)
     first = replace(planning, options=fast, ahead=False)
     least = plan_each(first, report).plans
     times = [plan.motion.duration for plan in least]
     longest = 2 * sum(times) if options.duration is None else options.duration
-    return plan_each(replace(planning, allowed=share_duration(times, longest), least=least), report)
+    while True:
+        allowed = replace(planning, allowed=share_duration(times, longest), least=least)
+        # Slower motions than these keep hardly more, and the NLP may not converge. Case: phase 2 of
+        # the rolling box in 2 s, which takes 0.45 s at least.
+        long = longest > LONG * sum(times)
+        try:
+            with unadvised() if long else nullcontext():
+                return plan_each(allowed, report)
+        except (InfeasibleError, SolverError):
+            if not long:
+                raise
+            longest /= 2
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
