@@ -84,12 +84,29 @@ def round_to(value: float, unit: float) -> float:
 
 
 def find_minima(values: Array) -> Array:
-    """Minimum along the middle axis of evenly spaced samples, refined by parabolas."""
+    """Minimum along the middle axis of evenly spaced samples, refined between them.
+
+    By the quartic through the five samples around the least one, or a parabola next to the ends.
+    Case: least effort of a box, whose torque is 2.6e-6 of its limit above that where parabolas
+    see 2.4e-7.
+    """
     before, middle, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
-    curvature = before - 2 * middle + after
+    slope, curvature = (after - before) / 2, before - 2 * middle + after
     inside = (middle <= before) & (middle <= after) & (curvature > 0)
-    depth = np.divide((after - before) ** 2, 8 * curvature, out=np.zeros_like(middle), where=inside)
-    return np.asarray(np.minimum((middle - depth).min(axis=1), values[:, [0, -1]].min(axis=1)))
+    third, fourth = np.zeros_like(slope), np.zeros_like(slope)
+    third[:, 1:-1] = (slope[:, 2:] - 2 * slope[:, 1:-1] + slope[:, :-2]) * inside[:, 1:-1]
+    fourth[:, 1:-1] = curvature[:, 2:] - 2 * curvature[:, 1:-1] + curvature[:, :-2]
+    # Derivatives of the quartic.
+    slope, curvature = slope - third / 6, np.maximum(curvature - fourth / 12, curvature / 2)
+    shift = np.zeros_like(slope)
+    for _ in range(2):
+        rate = slope + shift * (curvature + shift * (third / 2 + shift * fourth / 6))
+        change = curvature + shift * (third + shift * fourth / 2)
+        step = np.divide(rate, change, out=np.zeros_like(rate), where=inside & (change > 0))
+        shift = (shift - step).clip(-1, 1)
+    terms = curvature / 2 + shift * (third / 6 + shift * fourth / 24)
+    least = middle + shift * (slope + shift * terms)
+    return np.asarray(np.minimum(least.min(axis=1), values[:, [0, -1]].min(axis=1)))
 
 
 def find_lowest(t: Array, values: Array, min_step: float = 0.0) -> tuple[float, float]:

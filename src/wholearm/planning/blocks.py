@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -46,6 +47,7 @@ from .phase_plan import (
     share_duration,
 )
 
+LONG = 4.0  # ratio of a longest duration to the least time above which shorter ones are tried
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -118,12 +120,25 @@ def plan_blocks(
     planning = Planning(problem, curves, options, ())
     if options.goal is not Objective.MARGIN:
         return plan_each(planning, report)
+    from .explain import unadvised
+
     time_options = replace(options, objective=Objective.TIME, duration=None)
     fastest = plan_each(replace(planning, options=time_options, free_ends=False), report).plans
     times = [plan.motion.duration for plan in fastest]
     duration = 2 * sum(times) if options.duration is None else options.duration
-    durations = share_duration(times, duration)
-    return plan_each(replace(planning, durations=durations, fastest=fastest), report)
+    while True:
+        durations = share_duration(times, duration)
+        slower = replace(planning, durations=durations, fastest=fastest)
+        # Even slower motions hardly press harder, and the NLP may not converge. Case: phase 2 of
+        # the rolling box in 2 s, which takes 0.45 s at least.
+        is_long = duration > LONG * sum(times)
+        try:
+            with unadvised() if is_long else nullcontext():
+                return plan_each(slower, report)
+        except (InfeasibleError, SolverError):
+            if not is_long:
+                raise
+            duration /= 2
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:

@@ -181,6 +181,7 @@ class TimeNLP:
     rows: NlpRows
     rows_of: list[StageRows]
     duration_row: int  # row of the whole duration with a margin or a relaxation; otherwise -1
+    scaling: float  # of the objective for Ipopt, whose tolerances are for values of about 1
 
     @cached_property
     def solver(self) -> Expression:
@@ -191,7 +192,8 @@ class TimeNLP:
         """Ipopt with `push`, the initial distance from the bounds, and further options."""
         nlp, derivatives = self.assembled
         limits = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
-        return build_solver("time_nlp", nlp, push, derivatives, **limits, **options)
+        options |= {**limits, "obj_scaling_factor": self.scaling}
+        return build_solver("time_nlp", nlp, push, derivatives, **options)
 
 
 def build_time_nlp(
@@ -208,15 +210,21 @@ def build_time_nlp(
     rows_of, controls = [], scheme.controls
     # Weight of the duration, small beside violations.
     of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
+    # Without a cost of second differences torques ring, if their squares cost little. Case: least
+    # effort of the shipped square at a tenth of its size, where the weight of time is 4e5.
+    squares, weight = 0.0, 1.0
+    if target.objective is Objective.EFFORT:
+        squares, weight = 1.0, target.time_weight
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
         kernel, columns = effort_kernel(controls), _list_torques(layout)
-        if target.objective is Objective.EFFORT:
+        if squares:
             rows.add_copies(kernel, columns, cost=True)
-        elif controls > 2:
-            weights = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # avoids ringing
+        curvature = 1e-2 * weight * stage.formation.scene.torque_limit**-2.0 - 0.1 * squares
+        if controls > 2 and (curvature > 0).any():
+            weights = {"weight": np.maximum(curvature, 0.0)}
             rows.add_copies(curvature_kernel(controls), columns, weights, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
         cost[layout.shortfalls] = 1 / stage.intervals
@@ -232,9 +240,9 @@ def build_time_nlp(
         duration_row = int(total[0])
     N = tangent_basis(last_stage.formation, last_stage.guess.nodes[-1, 0])
     rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
-    assembled = rows.assemble(cost, end_z)
+    nlp = rows.assemble(cost, end_z)
     book(SolverStatistics(build_time=time.perf_counter() - start_time))
-    return TimeNLP(assembled, max_iter, layouts, rows, rows_of, duration_row)
+    return TimeNLP(nlp, max_iter, layouts, rows, rows_of, duration_row, 1 / (squares + weight))
 
 
 def _list_torques(layout: StageLayout) -> dict[str, Indices]:
