@@ -26,7 +26,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -36,7 +35,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 
 from ..common.arrays import Array, Expression, Flags
-from ..common.errors import InputError, WholearmError
+from ..common.errors import WholearmError
 from ..contacts.formation import Formation
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import metric_weights, null_vector
@@ -62,32 +61,40 @@ class Trace(NamedTuple):
 
 def follow(phase: Phase, z: Array) -> tuple[Trace, Trace]:
     """Follow a phase's contacts from `z`, shape (5,), both ways."""
-
-    def equations(z: Array) -> tuple[Array, Array]:
-        gaps, rows = constrain(phase.formation, z[None])
-        return gaps[0], rows[0, : gaps.shape[1]]
-
     # The phase before ends where bodies overlap by `OVERLAP`.
-    closed = project(phase.formation.scene, equations, z)
+    closed = project(phase, z)
     z = z if closed is None else closed
     return _march(phase, z, 1.0), _march(phase, z, -1.0)
 
 
-def project(
-    scene: Scene, equations: Callable[[Array], tuple[Array, Array]], z: Array
-) -> Array | None:
-    """Nearest zero of equations to `z`, by Newton's method; None if none.
+def project(phase: Phase, z: Array, end: bool = False) -> Array | None:
+    """Nearest configuration to `z` that closes a phase's contacts, at its `end` if that is asked.
 
-    `equations` gives their values, shape (m,), and rows of their Jacobian, (m, 5).
+    By Newton's method; None if there is none.
     """
+    scene = phase.formation.scene
     scale, size = np.sqrt(metric_weights(scene)), scene.scales.length
     for _ in range(20):
-        miss, rows = equations(z)
+        miss, rows = _find_misses(phase, z, end)
         step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ miss / scale
         z = z + step
         if np.abs(step * scale).max() < 1e-13 * size:
             break
-    return z if np.abs(equations(z)[0]).max() < 1e-9 * size else None
+    return z if np.abs(_find_misses(phase, z, end)[0]).max() < 1e-9 * size else None
+
+
+def _find_misses(phase: Phase, z: Array, end: bool) -> tuple[Array, Array]:
+    """Gaps at one configuration, with `end` also what is missing to that, and their rows (m, 5)."""
+    (gaps,), (rows,) = constrain(phase.formation, z[None])
+    rows, contact = rows[: len(gaps)], phase.until.contact
+    if not end:
+        return gaps, rows
+    if contact is not None:
+        touch = locate(phase.formation.scene, contact.name, z[None])
+        gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
+    places = dict(phase.until.poses)
+    missing = [z[k] - value for k, value in places.items()]
+    return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])
 
 
 def constrain(formation: Formation, z: Array) -> tuple[Array, Array]:
@@ -374,15 +381,12 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
     refusal of several is confirmed by that of any, and refuted by a motion of all.
     """
     match = re.search(r"phases?[ \[](\d+)(?: and (\d+)| to (\d+))?", str(error))
-    number = int(match[1]) if match else 1
-    last = int(match[2] or match[3] or match[1]) if match else len(problem.phases)
-    z = problem.start
-    open_end = Verdict("open", "")
-    planned = False
-    for phase in problem.phases:
-        concerned = number <= phase.number <= last
-        if planned and not concerned:
-            continue
+    numbers = [int(number) for number in match.groups() if number] if match else [1]
+    first, phases = numbers[0], problem.phases[: numbers[-1] if match else None]
+    z, index, verdict = problem.start, 0, Verdict("open", "")
+    while index < len(phases):
+        phase = phases[index]
+        concerned, index = phase.number >= first, phase.number
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
@@ -393,22 +397,18 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
-            if concerned:
-                verdict = _judge_curve(problem, phase, trace)
-                if verdict.kind != "refuted" or phase.number == last:
-                    return verdict
-                open_end = verdict
+            verdict = _judge_curve(problem, phase, trace) if concerned else verdict
+            if concerned and verdict.kind != "refuted":
+                break
             z = trace.end
             continue
         if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
-        before = None if concerned else _find_start(problem, number)
+        before = None if concerned else _find_start(problem, first)
         if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
-        z, planned = before, True
-    if isinstance(error, InputError) and not open_end.reason:
-        return Verdict("refuted", "every phase reaches its until")
-    return open_end
+        z, index = before, first - 1
+    return verdict
 
 
 def _find_start(problem: Problem, number: int) -> Array | None:
@@ -468,17 +468,16 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
 def list_ends(phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
     scene, formation = phase.formation.scene, phase.formation
-    project_end = partial(project, scene, partial(_end_equations, phase))
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = project_end(bend(formation, z, line[None])[0, -1])
-    first = project_end(z) if first is None else first
+    first = project(phase, bend(formation, z, line[None])[0, -1], end=True)
+    first = project(phase, z, end=True) if first is None else first
     if first is None:
         return np.zeros((0, 5))
     scale, far = np.sqrt(metric_weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
-    tangent = np.linalg.svd(_end_equations(phase, first)[1] / scale)[2][-1] / scale
+    tangent = np.linalg.svd(_find_misses(phase, first, end=True)[1] / scale)[2][-1] / scale
     steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
-    others = [project_end(first + step * tangent) for step in steps]
+    others = [project(phase, first + step * tangent, end=True) for step in steps]
     points = np.array([first, *(end for end in others if end is not None)])
     return points[inside(formation, points)]
 
@@ -552,14 +551,3 @@ def _find_margin(formation: Formation, epsilon: float, z: Array) -> float:
     s = np.append(0.0, np.cumsum(runs))
     margin = fast_margin(formation, epsilon, (s, z, np.gradient(z, s, axis=0, edge_order=2)))
     return float(np.nan_to_num(margin, nan=-np.inf))
-
-
-def _end_equations(phase: Phase, z: Array) -> tuple[Array, Array]:
-    """What is missing to contacts and end at one configuration, and its rows."""
-    (gaps,), (rows,) = constrain(phase.formation, z[None])
-    places, contact = dict(phase.until.poses), phase.until.contact
-    if contact is not None:
-        touch = locate(phase.formation.scene, contact.name, z[None])
-        gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
-    missing = [z[k] - value for k, value in places.items()]
-    return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])
