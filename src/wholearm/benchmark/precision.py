@@ -1,6 +1,6 @@
 """Run time against error, of planners and simulators, with public tools beside them.
 
-Methods run on phases of one freedom, on four sliding contacts. Planners are ours in both domains,
+Methods run on phases of one freedom, on four sliding contacts. Planners are ours along curves,
 toppra (minimum-time parametrisation, with the internal force eliminated from the limits) and yapss
 (pseudospectral collocation). All simulators but ours are told when directions reverse, from the
 reference, and are restarted there and where the torques step. Plans are replayed open loop from
@@ -223,25 +223,26 @@ def integrate(
     A stretch is in one piece of the torques, without a reversal: Xi, sigma, coefficients of its
     torques column by column, and its ends. Contacts stay closed: those that are lost pull.
     """
+
+    def solve(t: float, y: Array, part: Segment, own: TorqueProfile) -> tuple[Array, Array]:
+        tau = own.at(np.array([t]))[0]
+        return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
+
+    def rates(t: float, y: Array, *at: Any) -> Array:
+        return np.concatenate([y[5:], solve(t, y, *at)[0]])
+
     parts, t = [*curve.segments], float(torque.breaks[0])
     y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for stop in torque.breaks[1:]:
         while t < stop:
-            part, profile = parts[0], torque.cut(t, stop)
-
-            def solve(t: float, y: Array, part: Segment = part, own: Any = profile) -> Any:
-                tau = own.at(np.array([t]))[0]
-                return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
-
-            def rates(t: float, y: Array, solve: Any = solve) -> Array:
-                return np.concatenate([y[5:], solve(t, y)[0]])
-
+            part, profile = at = parts[0], torque.cut(t, stop)
             events = [_find_reversal(curve.formation, *parts[:2])] if len(parts) > 1 else []
-            options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "events": events}
-            run = solve_ivp(rates, (t, stop), y, "DOP853", **options)
-            least = min([least, *(solve(*at)[1].min() for at in zip(run.t, run.y.T, strict=True))])
+            options: Any = {"events": events, "rtol": tolerance, "atol": tolerance}
+            run = solve_ivp(rates, (t, stop), y, "DOP853", args=at, **options)
+            forces = (solve(*state, *at)[1] for state in zip(run.t, run.y.T, strict=True))
+            least = min(least, *map(np.min, forces))
             start, t, y = t, float(run.t[-1]), run.y[:, -1]
-            own = torque.cut(start, t).coefficients[0].ravel("F")
+            own = profile.cut(start, t).coefficients[0].ravel("F")
             stretches.append(np.concatenate([part.Xi, part.sigma, own, [start, t]]))
             parts = parts[1:] if run.status == 1 else parts
     return y, stretches, float(least)
@@ -252,7 +253,7 @@ def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any
     directions = np.append(before.Xi, before.sigma)
     row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
-    def rate(_: float, y: Array) -> float:
+    def rate(_: float, y: Array, *__: Any) -> float:
         return float(slides(formation, y[None, :5], y[None, 5:])[0, row])
 
     rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
@@ -330,8 +331,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     else:
         task = Task((curve,), problem.epsilon, PlanOptions(), (1,))
         motion, degree = plan_curves(task)[0].motion, 6
-    looks = np.linspace(0.0, motion.duration, 201)
-    if motion.evaluate(looks).c_n.min() <= 0:
+    if motion.evaluate(np.linspace(0.0, motion.duration, 201)).c_n.min() <= 0:
         return None
     marks = find_reversals(motion)
     stop = marks[-2] + 0.95 * (marks[-1] - marks[-2])
@@ -353,11 +353,8 @@ def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
     problem, curve = instance.problem, instance.curve
     state, _, least = integrate(problem, plan, curve, 1e-10)
     end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
-    limit = problem.scene.torque_limit
-    places = np.cos(np.linspace(0.0, np.pi, 9))
-    excess = float((np.abs(plan.at_places(places)) / limit[:, None] - 1).max())
-    missing = (problem.epsilon - least) / problem.scene.scales.force
-    violation = max(0.0, excess, missing)
+    excess = float((plan.peaks / problem.scene.torque_limit).max()) - 1
+    violation = max(0.0, excess, (problem.epsilon - least) / problem.scene.scales.force)
     tests = (
         (least > 0, "a contact is lost between nodes"),
         (end <= 1e-2, "the replay ends elsewhere"),
@@ -410,7 +407,8 @@ def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
 def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
     import toppra
-    from toppra.constraint import DiscretizationType, SecondOrderConstraint
+    from toppra.constraint import DiscretizationType, LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     toppra.setup_logging("ERROR")
     length = instance.curve.length
@@ -421,15 +419,15 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
         far = grid[np.abs(grid - stop) > 4 * apart]
         grid = np.sort([*far, stop - apart, stop + apart])
     rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
-    rows = rows[:, rows[..., A].any(axis=0)]
+    constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
+    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
-    def find_slack(s: Array, v: Array, a: Array) -> Array:
-        row = rows[np.abs(grid - s).argmin()]
-        return np.asarray(row[:, ONE] + a * row[:, A] + v**2 * row[:, B])
-
-    sides, scheme = -np.eye(rows.shape[1]), DiscretizationType.Interpolation
-    slack = find_slack, lambda _: sides, lambda _: np.zeros(len(sides))
-    limits = SecondOrderConstraint(*slack, 1, discretization_scheme=scheme)
+    # The parameters of the limits, with the internal force eliminated, are those of the grid.
+    limits, columns = LinearConstraint(), (a, b, constant, below, zero, None, None, grid)
+    limits.identical = True
+    limits.set_discretization_type(DiscretizationType.Interpolation)
+    parameters = canlinear_colloc_to_interpolate(*columns, identical=True)
+    limits.compute_constraint_params = lambda *_: parameters
     path = toppra.SplineInterpolator(grid, grid[:, None])
     options = {"solver_wrapper": "seidel", "parametrizer": "ParametrizeConstAccel"}
     planner = toppra.algorithm.TOPPRA([limits], path, gridpoints=grid, **options)

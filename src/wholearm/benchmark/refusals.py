@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import BPoly
 from scipy.optimize import brentq, linprog
 
 from ..common.arrays import Array, Expression, Flags
@@ -285,21 +286,16 @@ def _solve_along(
     chord = b[moving] / root
     bent = [(x * root + chord / x) / 2 - between for x in np.geomspace(1e-3, 1.0, 13)]
     bent.append(between - chord)
-    upper = ca.vertcat(_stack(kept) - margin, _stack(bent))
-    (A_ub, b_ub), (A_eq, b_eq) = (_split(rows, unknowns) for rows in (upper, _stack(equal)))
+    upper = [*(rows - margin for rows in kept), *bent]
+    (A_ub, b_ub), (A_eq, b_eq) = (_split(parts, unknowns) for parts in (upper, equal))
     least = np.repeat([0.0, -np.inf], [2 * n, 2 * count + 1])
     most = [*top, *np.where(top > 0, np.inf, 0.0), *np.full(2 * count, np.inf), 1.0]
     return maximise(-A_ub, b_ub, A_eq, -b_eq, [*zip(least, most, strict=True)])
 
 
-def _stack(parts: Sequence[Expression]) -> Expression:
-    """All entries of matrices in one column."""
-    return ca.vertcat(*map(ca.vec, parts))
-
-
-def _split(rows: Expression, unknowns: Expression) -> tuple[Any, Array]:
-    """Coefficients of rows that are linear in the unknowns, and what is left without these."""
-    A, rest = map(ca.evalf, ca.linear_coeff(rows, unknowns))
+def _split(parts: Sequence[Expression], unknowns: Expression) -> tuple[Any, Array]:
+    """Coefficients of all entries, which are linear in the unknowns, and what is left of them."""
+    A, rest = map(ca.evalf, ca.linear_coeff(ca.vertcat(*map(ca.vec, parts)), unknowns))
     return A.sparse(), rest.full()[:, 0]
 
 
@@ -308,30 +304,25 @@ def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
 
     A contact that does not slide sticks, or slips either way. Forces are not unique at 0 and below.
     """
-    rates = np.abs(slides(formation, z, z_s)[:, : formation.n_contacts]).max(axis=0)
-    still = [c for c, rate in zip(formation.contacts, rates, strict=True) if rate < 1e-9]
-    held = replace(formation, rolling=tuple({*formation.rolling, *still}))
-    signs, rows = _signs(formation, z, z_s), constrain(held, z)[1]
-    light, ratios = rows / formation.scene.mass_diagonal, [np.ones(len(z))]
-    without = light @ rows.transpose(0, 2, 1)
-    slips, options = list[Array](), list[list[Any]]()
-    for k, name in enumerate(formation.names):
-        # Of each choice the rows of accelerations, and the columns of forces.
-        options.append([((), ()), ((k,), (k,))])
-        if k in held.rolling_rows:
-            touch, column = locate(formation.scene, name, z), rows.shape[1] + len(slips)
-            slips += [touch.normal - sign * touch.friction * touch.tangent for sign in (1, -1)]
-            sticks = (k, formation.n_contacts + held.rolling_rows.index(k))
-            options[k][1:] = [(sticks, sticks), ((k,), (column,)), ((k,), (column + 1,))]
+    touches = [locate(formation.scene, name, z) for name in formation.names]
+    normals = np.stack([touch.normal for touch in touches], axis=1)
+    tangents = np.stack([touch.tangent for touch in touches], axis=1)
+    rates = np.abs(slides(formation, z, z_s)[:, : len(touches)]).max(axis=0)
+    rates[list(formation.rolling_rows)] = 0.0
+    # None: a contact is open; 0, 1, -1: one sticks or slips; NaN: one slides as along the curve.
+    options = [(None, 0.0, 1.0, -1.0) if rate < 1e-9 else (None, np.nan) for rate in rates]
+    signs, ratios = _signs(formation, z, z_s)[:, : len(touches)], [np.ones(len(z))]
     for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        columns = [_push(held, z, side), *(slip[:, :, None] for slip in slips)]
-        matrix = light @ np.concatenate(columns, axis=2)
-        for choices in product(*options):
-            of_rows, forces = (sum(parts, ()) for parts in zip(*choices, strict=True))
-            smooth = without[:, of_rows][:, :, of_rows]
-            below = np.linalg.det(smooth)
+        for choice in product(*options):
+            closed, given = [sense is not None for sense in choice], np.array(choice, dtype=float)
+            senses, stuck = np.where(np.isnan(given), side, given), tangents[:, given == 0]
+            friction = (formation.friction * senses)[..., None] * tangents
+            rows = np.concatenate([normals[:, closed], stuck], axis=1)
+            forces = np.concatenate([(normals - friction)[:, closed], stuck], axis=1)
+            light = rows / formation.scene.mass_diagonal
+            smooth = light @ rows.transpose(0, 2, 1)
+            below, minor = np.linalg.det(smooth), np.linalg.det(light @ forces.transpose(0, 2, 1))
             independent = below > 1e-12 * np.einsum("nii->ni", smooth).prod(axis=1)
-            minor = np.linalg.det(matrix[:, of_rows][:, :, forces])
             ratios.append(np.divide(minor, below, out=np.ones_like(below), where=independent))
     return np.asarray(np.min(ratios, axis=0))
 
@@ -495,7 +486,7 @@ def find_best(
     # Control points of cubic curves, shape (n, 4, 2): straight ones, and 400 that bend.
     share = np.linspace(0, 1, 4)[:, None]
     straight = share * (goals - start)[:, None] + start
-    drawn = share * (goals[rng.integers(len(goals), size=400)] - start)[:, None] + start
+    drawn = straight[rng.integers(len(goals), size=400)]
     width = 0.5 * rng.uniform(size=(400, 1, 1)) * size
     drawn[:, 1:3] += width * rng.normal(size=(400, 2, 2))
     margins, tried = [-np.inf], [z[None]]
@@ -513,14 +504,12 @@ def find_best(
 
 def bend(formation: Formation, z: Array, controls: Array) -> Array:
     """Configurations of cubic curves from `z`, forty along each, shape (n, 40, 5)."""
-    u = np.linspace(0.0, 1.0, 40)[:, None]
-    shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
-    poses = np.einsum("uk,nkd->nud", shares, controls)
-    curves = np.tile(z, (*poses.shape[:2], 1))
-    for k in range(1, len(u)):
+    poses = BPoly(controls.swapaxes(0, 1)[:, None], [0.0, 1.0])(np.linspace(0.0, 1.0, 40))
+    curves = [np.tile(z, (len(controls), 1))]
+    for pose in poses[1:]:
         # Newton's method for y and the joints, from the place before.
-        place = curves[:, k - 1].copy()
-        place[:, [0, 2]] = poses[:, k]
+        place = curves[-1].copy()
+        place[:, [0, 2]] = pose
         for _ in range(6):
             gaps, rows = constrain(formation, place)
             rows = rows[:, :, [1, 3, 4]]
@@ -528,8 +517,8 @@ def bend(formation: Formation, z: Array, controls: Array) -> Array:
             rows[flat] = np.eye(3)
             step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
             place[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
-        curves[:, k] = place
-    return curves
+        curves.append(place)
+    return np.stack(curves, axis=1)
 
 
 def inside(formation: Formation, z: Array) -> Flags:

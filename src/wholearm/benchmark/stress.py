@@ -516,19 +516,18 @@ def run_file(seed: int, number: int) -> dict[str, Any]:
     """Run the command line on a file of a seed in this process, and look at what it leaves."""
     from ..__main__ import start
 
-    rng, k = np.random.default_rng([seed, number, 1]), (0, 0, 1, 2, 2)[number % 5]
+    rng, k = np.random.default_rng([seed, number]), (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
     ways: tuple[Callable[[Random, bytes], tuple[str, bytes | None]], ...]
     ways = _damage_problem, damage_torques, _damage_archive, _damage_bytes
     what, content = ways[-1 if rng.uniform() < 0.25 else k](rng, base_files()[k])
     if rng.uniform() < 0.01:
         ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
-    rng, (problem, torques, _) = np.random.default_rng([seed, number, 2]), base_files()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         file, valid, table = (folder / n for n in (f"mutant{ending}", "own.toml", "own.csv"))
-        valid.write_bytes(problem)
-        table.write_bytes(torques)
+        for path, own in zip((valid, table), base_files(), strict=False):
+            path.write_bytes(own)
         if content is None:
             file.mkdir()
         else:
