@@ -467,7 +467,7 @@ def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
 FILES = (str(HEPTAGON),)
 LEAST = {precision.LEAST_TIME: 0.0666298, precision.NO_DRAG: 0.0663431}
 """Least times of the fourth phase, within 1e-5."""
-TRIED = {"wholearm, curve": "1e-3", "wholearm, time": "8 x 3", "yapss": "20", "toppra": "100"}
+TRIED = {"wholearm, curve": "1e-3", "yapss": "20", "toppra": "100"}
 
 
 @lru_cache

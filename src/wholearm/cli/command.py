@@ -520,7 +520,7 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     InputError, with the file, if a plan or policy cannot be used for the problem.
     """
     from ..problem.read import adopt_phases
-    from ..results.adopt import describe_origin
+    from ..results.adopt import describe_origin, require_same_contacts
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
     policy_path, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
@@ -528,6 +528,8 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
         policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
         origins.append(("policy", policy_path, policy.about))
     problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
+    with name_source(path):
+        require_same_contacts(problem, plan)
     for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
