@@ -704,7 +704,7 @@ def _examine_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        rest = modes.find_rest(formation, z)
+        rest = modes.Rest(formation, z)
         free = [path for path in rest.list_modes() if path.slides(tau)]
         worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
         response = None if worst is None else worst.response
@@ -824,7 +824,7 @@ def find_resting_changes(
         solutions = ((path, find_least_change(*sides, free)) for path, sides in starts)
         least = [(path, unit * one) for path, one in solutions if one is not None]
         moved = [change for path, change in least if path.moves(tau + change)]
-        held = None if moved else rest.statics.find_holding_change(tau, epsilon, free)
+        held = None if moved else rest.find_holding_change(tau, epsilon, free)
         if moved:
             changes.append(make_advice(min(moved, key=np.linalg.norm), tau))
         elif held is not None and (len(free) == 1 or not changes):
