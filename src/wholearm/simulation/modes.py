@@ -263,7 +263,7 @@ class StartMode(NamedTuple):
         load = np.array([1.0, *tau])
         return (
             self.response.ratio > 0
-            and self.drive(tau) > STILL * self.rest.drive
+            and self.drive(tau) > STILL * self.rest.unit
             and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
             and self.rest.opens(self.response.acceleration @ load)
         )
@@ -294,8 +294,8 @@ class Rest(Statics):
             )
         # (5,): with one freedom the direction, of length one in the metric M5
         self.heading = self.freedoms[:, 0] if freedoms == 1 else None
-        # [kg^(1/2) m/s^2]: unit of accelerations in the metric M5
-        self.drive = math.sqrt(scales.mass) * scales.acceleration
+        # [kg^(1/2) m/s^2]: of accelerations in the metric M5
+        self.unit = math.sqrt(scales.mass) * scales.acceleration
 
     @cached_property
     def sliding(self) -> tuple[StartMode, ...]:
@@ -343,6 +343,7 @@ class Rest(Statics):
         What is stationary here has the direction that it has just after; zero if it stays so.
         """
         scene = self.scene
+        # In which something moves by its unit; just after is 1e-5 of it later.
         time = 1 / np.abs(heading / build_system(scene).units[:5]).max()
         units = np.repeat([scene.scales.length, 1.0], [self.formation.n_contacts, 2]) / time
         at = self.formation.evaluate(self.z[None], heading[None])
@@ -372,7 +373,7 @@ class Rest(Statics):
         still, closing = STILL, 1e-7
         if heading is not None:
             # All accelerations are multiples of this one.
-            slips = (heading * mass @ response.acceleration)[None] / self.drive
+            slips = (heading * mass @ response.acceleration)[None] / self.unit
             still, closing = -STILL, 0.0
         margins = np.vstack([limits[kept], slips, limits[~kept], openings])
         sizes = [kept.sum(), len(slips), (~kept).sum(), len(openings)]
@@ -408,7 +409,7 @@ class Rest(Statics):
                 break
             modes = [every[k] for k in np.flatnonzero(chosen)]
             for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
-                if mode.drive(tau) > 1e3 * STILL * self.drive and mode.moves(tau):
+                if mode.drive(tau) > 1e3 * STILL * self.unit and mode.moves(tau):
                     return mode.depart(start, tau)
         return self._collapse(coefficients, loss) if loss <= 1 else None
 
