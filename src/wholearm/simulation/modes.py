@@ -46,7 +46,7 @@ from ..common.arrays import Array, Flags, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import close_all, find_freedoms, move_least
+from ..mechanics.dynamics import close_all, move_least
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
@@ -541,19 +541,16 @@ def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
     """Rows that have to be positive at rest, over their saturation values, shape (k, 3)."""
-    touching, z = place.touching, place.z
-    scene = touching.scene
-    static = Statics(touching, z).torque_polygon(epsilon)
-    rows = [np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)]
-    A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
-    count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
-    for kept in combinations(touching.contacts, 4) if count == 5 else ():
-        others = [k for k, contact in enumerate(touching.contacts) if contact not in kept]
+    statics, contacts = Statics(place.touching, place.z), place.touching.contacts
+    held, scene = statics.torque_polygon(epsilon), statics.scene
+    rows = [np.column_stack([held.bounds, -held.normals]) / (AMPLE * scene.scales.torque)]
+    for kept in combinations(contacts, 4) if not statics.freedoms.size else ():
+        others = [k for k, contact in enumerate(contacts) if contact not in kept]
         # Motions that give up the other contacts.
         rows += [
             -mode.slips / AMPLE
-            for mode in _list_sliding(Formation(scene, kept), z)
-            if mode.heading is not None and (A[others] @ mode.heading >= -_SMALL).all()
+            for mode in _list_sliding(Formation(scene, kept), place.z)
+            if mode.heading is not None and (statics.A[others] @ mode.heading >= -_SMALL).all()
         ]
     return np.vstack(rows)
 
@@ -571,9 +568,8 @@ def find_opening(place: Standstill) -> Array | None:
     if place.gained is None:
         return None
     scene = place.formation.scene
-    at = place.z[None], np.zeros((1, 5))
-    normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
-    N = find_freedoms(place.formation.evaluate(*at).P[0], scene.mass_diagonal, _SMALL)
+    normal = Statics(Formation(scene, (place.gained,)), place.z).A[0]
+    N = Statics(place.formation, place.z).freedoms
     push = N.T @ normal
     rate = float(push @ push)
     if rate <= 3e-5 * float(normal**2 @ (1 / scene.mass_diagonal)):
@@ -585,7 +581,7 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
     """Torques of largest margin that accelerate the formation towards a contact open by `gap`."""
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
-    normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
+    normal = Statics(Formation(scene, (place.gained,)), z).A[0]
     scales, held = scene.scales, Statics(place.formation, z).torque_polygon()
     best: Hold | None = None
     for mode in _list_sliding(place.formation, z):
