@@ -33,13 +33,7 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import (
-    DRIVE,
-    find_rest,
-    find_standstill,
-    maximise_margin,
-    require_closed,
-)
+from wholearm.simulation.modes import DRIVE, Rest, find_standstill, maximise_margin, require_closed
 from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
@@ -129,13 +123,13 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
         gained = Formation(problem.scene, (phase.until.contact,))
         normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
-        first = find_rest(phase.formation, z).sliding[0]
+        first = Rest(phase.formation, z).sliding[0]
         assert first.heading is not None
         back = settling.gap / (normal @ first.heading) * first.heading
         z = require_closed(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
-        tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).sliding
+        tau, (one, two) = np.array(settling.tau), Rest(phase.formation, z).sliding
         assert one.heading is not None and two.heading is not None
         way = one if normal @ one.heading < 0 else two
         closing = -float(normal @ way.heading) * way.drive(tau)

@@ -701,7 +701,7 @@ def _advise_on_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     at_rest = bool(np.isnan(simulation.c_n[row, columns]).all())
     if at_rest:
-        rest = modes.find_rest(formation, z)
+        rest = modes.Rest(formation, z)
         free = [path for path in rest.list_modes() if path.slides(tau)]
         worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
         response = None if worst is None else worst.response
@@ -821,7 +821,7 @@ def find_resting_changes(
         solutions = ((path, find_least_change(*sides, torques)) for path, sides in starts)
         least = [(path, unit * change) for path, change in solutions if change is not None]
         moving = [change for path, change in least if path.moves(tau + change)]
-        holding = None if moving else rest.statics.find_holding_change(tau, epsilon, torques)
+        holding = None if moving else rest.find_holding_change(tau, epsilon, torques)
         if moving:
             changes.append(make_advice(min(moving, key=np.linalg.norm), tau))
         elif holding is not None and (len(torques) == 1 or not changes):
