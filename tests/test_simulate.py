@@ -108,7 +108,7 @@ def test_a_reversal_next_to_a_stop_turns_all_that_slides() -> None:
     replay = Replay(problem, torque, 1e-9, np.array([math.inf]), minima=False)
     replay.enter(problem.phases[0], None)
     replay.y[:10] = [*sample.z[0], *(-1e-8 * scales.speed * tangent)]
-    assert replay.go_on() is None
+    assert replay.continue_motion() is None
     after = motion.curve.segments[1]
     assert replay.signs == pytest.approx([*after.Xi, *after.sigma])
 

@@ -42,7 +42,7 @@ from ..simulation.modes import (
     require_closed,
 )
 from ..simulation.simulate import simulate_free
-from ..simulation.system import SLOW, build_system
+from ..simulation.system import REST_SPEED, build_system
 from .options import PlanOptions
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
@@ -167,7 +167,7 @@ def settle_plans(problem: Problem, plans: Plans) -> Plans:
     places = list[Standstill | None]()  # where phases come to rest
     for phase, plan in zip(problem.phases, plans, strict=True):
         z, v = end_of(plan)
-        at_rest = build_system(problem.scene).is_slower(v, SLOW)
+        at_rest = build_system(problem.scene).is_slower(v, REST_SPEED)
         places.append(find_standstill(problem, phase, z) if at_rest else None)
     if problem.settle_share:
         ends = share_time(problem, plans, places)

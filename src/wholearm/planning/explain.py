@@ -388,7 +388,7 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
     text = f"phase {phase.number} is infeasible: {place}, {where}, {fails} in any contact mode"
     shortfalls = list[Shortfall]()
     if blocked.contact:
-        contact, share = blocked.contact, blocked.short
+        contact, share = blocked.contact, blocked.shortfall
         amount = share * problem.scene.scales.force
         limit = f"c_n of {contact} >= epsilon = {problem.epsilon:g} N"
         text += f": {limit} is {amount:.3g} N short at best"

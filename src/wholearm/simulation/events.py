@@ -32,12 +32,12 @@ class EventKind(Enum):
     SLIP = "slip"  # friction no longer holds a contact or joint; a rolling one ends the motion
     LIMIT = "limit"  # the formation stops being valid in another way
     END = "end"  # the torques end before the goal
-    GAINED = "contact gained"  # a contact that nothing was said about presses from here on
+    GAINED = "contact gained"  # a contact outside the prescribed formation closes
     PASS = "pass"  # a contact goes on as one of a neighbouring feature
-    CHATTER = "chatter"  # impacts that come ever faster are over: the contact stays closed
-    AMBIGUOUS = "ambiguous"  # several motions are possible; the one nearest to the last is taken
+    CHATTER = "chatter"  # the end of a sequence of ever faster impacts: the contact stays closed
+    AMBIGUOUS = "ambiguous"  # several motions are possible; the nearest modes are taken
     INCONSISTENT = "inconsistent"  # no motion has finite forces: an impact without a collision
-    GIVEN_UP = "given up"  # events come without time passing, or steps do not get anywhere
+    GIVEN_UP = "given up"  # events without progress of time, or underflow of the step size
 
 
 class Event(NamedTuple):
@@ -51,13 +51,13 @@ class Event(NamedTuple):
     # arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost and
     # release: the c_n that the contact would need [N]; slip of a contact that the phase lets roll:
     # its margin mu c_n - |c_t| [N]; impact: the least impulse, that of `contact` [N s]; end: the
-    # distance to the phase's end [m or rad], NaN if that is a release; NaN otherwise. Where no
-    # contacts are told, impact: the speed at which the gap closed [m/s].
+    # distance to the phase's end [m or rad], NaN if that is a release; NaN otherwise. With free
+    # contacts, impact: the closing speed of the gap [m/s].
     value: float = float("nan")
 
 
 def describe_change(name: str, before: float, after: float, verb: str) -> tuple[EventKind, str]:
-    """Kind and text of a change of direction, 0 for none, of what `verb`: slides or turns."""
+    """Kind and text of a change of sign, 0 at rest; `verb` is slides or turns."""
     slides = verb == "slides"
     if after == 0:
         return EventKind.STICK, f"{name} sticks" if slides else f"friction holds {name}"
@@ -75,12 +75,12 @@ class OutcomeKind(Enum):
     HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"
-    ENDED = "ended"  # a simulation that is told no contacts came to its end
+    ENDED = "ended"  # a simulation that with free contacts reached its end
     GIVEN_UP = "given up"
 
 
 class Outcome(NamedTuple):
-    """How a simulation ended, with one sentence that says it."""
+    """How a simulation ended, in one sentence."""
 
     kind: OutcomeKind
     text: str
@@ -100,7 +100,7 @@ class Energies(NamedTuple):
     viscous: Array
     dry: Array
     contact: Array
-    impact: Array  # lost so far where a contact gained stopped the motion, or part of it
+    impact: Array  # lost so far in impacts
 
     @property
     def residual(self) -> Array:
@@ -110,22 +110,22 @@ class Energies(NamedTuple):
 
 
 class FreeStretch(NamedTuple):
-    """Some time in which a contact presses."""
+    """Interval in which a contact presses."""
 
     contact: str
     start: float  # start, stop [s]:
     stop: float
-    # [N]: its least c_n then; NaN where everything rests, as forces are indeterminate there
+    # [N]: its least c_n; NaN at rest, where forces are indeterminate
     least: float
-    time: float  # [s]: when
+    time: float  # [s]: instant of the least c_n
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Drawn):
     """A simulated motion at every accepted step and requested instant, twice where forces jump.
 
-    With free contacts phases are those of a plan's clock, `contacts` has others that pressed,
-    forces are NaN where a contact does not press, and events are there twice.
+    With free contacts phases follow the clock of a plan, `contacts` includes others that pressed,
+    forces of open contacts are NaN, and instants of events are recorded twice.
     """
 
     t: Array  # (n,) [s]
@@ -140,7 +140,7 @@ class Simulation(Drawn):
     c_n: Array
     c_t: Array
     problem: Problem = field(repr=False)
-    torque: TorqueProfile = field(repr=False)  # what was simulated
+    torque: TorqueProfile = field(repr=False)  # the simulated torques
     events: tuple[Event, ...]
     energies: Energies
     outcome: Outcome
@@ -149,35 +149,35 @@ class Simulation(Drawn):
     missed_by: float
     steps: int  # steps, rejected: accepted and rejected Runge-Kutta steps
     rejected: int
-    # when each pair of features pressed, by the order of their start
+    # intervals in which pairs of features pressed, ordered by their start
     stretches: tuple[FreeStretch, ...] = field(repr=False)
     residual: float  # largest residual of a contact problem, relative to its largest rate
 
     @property
     def headline(self) -> str:
-        """How it ended, in a line."""
+        """The outcome, in a line."""
         return f"{self.problem.name!r}, {self.t[-1]:.6g} s: {self.outcome.text}"
 
     @property
     def trajectory(self) -> Trajectory:
-        """The simulated motion as a trajectory, as of a plan, without phases of one instant.
+        """The simulated motion in the format of a plan, without phases of one instant.
 
         SimulationError if there is no motion.
         """
-        chosen, problem = list[Numbers](), self.problem
+        phase_rows, problem = list[Numbers](), self.problem
         # Rows whose times increase in each phase, but for one repetition where forces step.
         for index in range(int(self.phase[-1]) + 1):
             rows = np.flatnonzero(self.phase == index)
             t = self.t[rows]
             before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
-            # At the end of a phase what comes before the last step stands for its last instant.
-            chosen.append(rows[before | (after & (t < t[-1]))])
-            if len(chosen[-1]) < 2:
-                chosen.pop()
+            # At the end of a phase the row before the last step stands for its last instant.
+            phase_rows.append(rows[before | (after & (t < t[-1]))])
+            if len(phase_rows[-1]) < 2:
+                phase_rows.pop()
                 break
-        if not chosen:
+        if not phase_rows:
             raise SimulationError(f"there is no motion to keep: {self.outcome.text}")
-        rows = np.concatenate(chosen)
+        rows = np.concatenate(phase_rows)
         t, phases = self.t[rows], self.phase[rows]
         samples = Samples(*(getattr(self, name)[rows] for name in Samples._fields))
         motions = sample_phases(t, phases, samples, self.contacts, self.torque)
@@ -195,51 +195,51 @@ class Simulation(Drawn):
         return Trajectory(**arrays, torque=self.torque, motions=motions, meta=meta)
 
     def find(self, *kinds: EventKind, phase: int | None = None) -> tuple[Event, ...]:
-        """Events of some kinds in the order of time, all or those of a phase by its index."""
+        """Events of some kinds in the order of time, of all phases or of one by its index."""
         events = (event for event in self.events if event.kind in kinds)
         return tuple(event for event in events if phase is None or event.phase == phase)
 
     def count_phases(self, starts: Sequence[float] | Array) -> Simulation:
-        """The same with phases that begin at given times [s], in their order."""
+        """The same simulation with phases that begin at `starts` [s], in rising order."""
         clock = np.asarray(starts)
-        owners = np.searchsorted(clock, [event.time for event in self.events], side="right") - 1
-        owned = zip(self.events, owners.tolist(), strict=True)
-        events = tuple(event._replace(phase=max(owner, 0)) for event, owner in owned)
-        # Of two rows at a boundary the first one ends the phase before.
-        twice = np.append(np.diff(self.t) == 0, False) & np.isin(self.t, clock[1:])
-        phase = np.maximum(np.searchsorted(clock, self.t, side="right") - 1 - twice, 0)
+        phases = np.searchsorted(clock, [event.time for event in self.events], side="right") - 1
+        pairs = zip(self.events, phases.tolist(), strict=True)
+        events = tuple(event._replace(phase=max(index, 0)) for event, index in pairs)
+        # Of two rows at a boundary the first one belongs to the previous phase.
+        is_repeated = np.append(np.diff(self.t) == 0, False) & np.isin(self.t, clock[1:])
+        phase = np.maximum(np.searchsorted(clock, self.t, side="right") - 1 - is_repeated, 0)
         return replace(self, phase=phase, events=events)
 
     def show(self, contacts: Sequence[str]) -> Simulation:
-        """The same with other columns of forces, NaN where a contact never pressed."""
+        """The same simulation with forces of other contacts; NaN if a contact never pressed."""
         forces = np.full((2, len(self.t), len(contacts)), np.nan)
         for column, name in enumerate(contacts):
             if name in self.contacts:
-                at = self.contacts.index(name)
-                forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
+                source = self.contacts.index(name)
+                forces[:, :, column] = self.c_n[:, source], self.c_t[:, source]
         return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
 
     def list_pauses(
         self, contact: str, start: float, stop: float, aliases: Collection[str] = ()
     ) -> list[tuple[float, float]]:
-        """When a contact does not press between two times [s], in their order.
+        """Intervals between two times [s] in which a contact does not press.
 
-        `aliases` are other names under which it presses, as it goes on to a neighbouring feature.
+        `aliases` are neighbouring features to which the contact may pass.
         """
-        pauses, at, names = [], start, {contact, *aliases}
-        pressed = sorted((one.start, one.stop) for one in self.stretches if one.contact in names)
-        for first, last in pressed:
-            if first > at:
-                pauses.append((at, min(first, stop)))
-            at = max(at, last)
-            if at >= stop:
+        pauses, time, names = [], start, {contact, *aliases}
+        spans = sorted((part.start, part.stop) for part in self.stretches if part.contact in names)
+        for first, last in spans:
+            if first > time:
+                pauses.append((time, min(first, stop)))
+            time = max(time, last)
+            if time >= stop:
                 return pauses
-        return [*pauses, (at, stop)]
+        return [*pauses, (time, stop)]
 
     def at(self, t: float) -> Array:
         """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
 
-        ValueError if `t` was not among the instants asked for and no step ends there.
+        ValueError if `t` was not a requested instant and no step ends there.
         """
         index = int(np.searchsorted(self.t, t, side="right")) - 1
         if index < 0 or self.t[index] != t:
@@ -251,7 +251,7 @@ FreeSimulation = Simulation  # the name of earlier versions for one with free co
 
 
 class Record(NamedTuple):
-    """One instant of a running simulation."""
+    """State, forces and torques at one instant."""
 
     t: float
     phase: int
@@ -265,13 +265,13 @@ class Record(NamedTuple):
 
 
 def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:
-    """When each pair pressed, without a pause."""
+    """Maximal intervals in which each pair presses."""
     stretches: list[FreeStretch] = []
     for pair in {pair for row in rows for pair in row.kept}:
         for run in find_runs(np.array([pair in row.kept for row in rows])):
             block = rows[run]
             c_n = np.array([row.c_n[row.kept.index(pair)] for row in block])
-            at = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
-            least = float(c_n[at]), block[at].t
-            stretches.append(FreeStretch(names[pair], block[0].t, block[-1].t, *least))
+            k = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
+            minimum = float(c_n[k]), block[k].t
+            stretches.append(FreeStretch(names[pair], block[0].t, block[-1].t, *minimum))
     return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))

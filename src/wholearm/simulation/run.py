@@ -1,4 +1,4 @@
-"""State, torques and records of a running simulation, and its steps; torques of a feedback law."""
+"""State, torques, records and integration steps of a simulation; sampled feedback laws."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from .system import (
     build_stepper,
 )
 
-SAME = 1e-9  # distance of two instants that counts as none, relative to the period
+SAME = 1e-9  # difference of two instants that counts as zero, relative to the period
 
 
 class StuckError(ArithmeticError):
-    """Steps become too short to get anywhere."""
+    """The step size underflows."""
 
 
 class Run(ABC):
-    """A running simulation; the rule that decides on contacts is that of the class."""
+    """A running simulation; subclasses define the rule that selects contact modes."""
 
-    t: float  # t, h [s]: present time, and the step to try next
+    t: float  # t, h [s]: present time, and the next trial step
     h: float
     y: Array  # (2 n + LOSSES,): z, z', then work, viscous, dry and contact losses
     modes: Modes
-    s: ModeStepper  # steps of the present modes
-    piece: int  # of the torques, which the present time belongs to
+    s: ModeStepper  # compiled steps of the present modes
+    piece: int  # index of the present piece of the torques
     steps_at: list[bool]  # whether the torques step at the start of each piece
     impact: float  # [J]: energy lost to impacts so far
-    wanted: deque[float]  # [s]: later instants at which steps have to end; infinity is last
-    # values, start: event values after the step just made and before it, in units of the scene: an
-    # event is where one falls below zero
+    times: deque[float]  # [s]: remaining instants at which steps have to end; infinity is last
+    # values, start: event values after the last step and before it, in units of the scene; an
+    # event is a zero crossing to negative values
     values: Array
     start: Array
-    slack: Array  # how far below zero each of them counts as rounding
+    slack: Array  # largest negative event value that counts as rounding
     longest = math.inf  # [s]: longest step from the present state
 
     def __init__(
@@ -60,7 +60,7 @@ class Run(ABC):
         z: Array,
         v: Array,
         tolerance: float = 1e-9,
-        wanted: Sequence[float] | Array = (),
+        times: Sequence[float] | Array = (),
     ) -> None:
         self.feedback = torque if isinstance(torque, Feedback) else None
         torque = torque.torque if isinstance(torque, Feedback) else torque
@@ -74,11 +74,11 @@ class Run(ABC):
         self.phase_index = self.steps = self.rejected = 0
         self.records: list[Record] = []
         self.events: list[Event] = []
-        within = (t for t in wanted if self.breaks[0] <= t <= self.breaks[-1])
-        self.wanted = deque([*map(float, within), math.inf])
+        inner = (t for t in times if self.breaks[0] <= t <= self.breaks[-1])
+        self.times = deque([*map(float, inner), math.inf])
         self.residual = 0.0
         self.sample()
-        self.decisions, self.decided_at = 0, -math.inf
+        self.decisions, self.decision_time = 0, -math.inf
 
     @property
     def z(self) -> Array:
@@ -92,58 +92,58 @@ class Run(ABC):
 
     @property
     def stop(self) -> float:
-        """When the present piece of the torques ends [s]."""
+        """End of the present piece of the torques [s]."""
         return self.breaks[self.piece + 1]
 
     @property
     def near(self) -> float:
-        """Width of the bracket of an event that is narrow enough [s]."""
+        """Tolerance of event times: final width of the bracket [s]."""
         return 1e-3 * SHORTEST_STEP * max(self.system.scales.time, abs(self.t))
 
     @abstractmethod
     def measure(self) -> Array:
-        """Event values after the step just made."""
+        """Event values after the last step."""
 
     @property
     @abstractmethod
     def shift(self) -> Array:
-        """How far below zero each event value has to fall, by its value before the step."""
+        """Threshold of each event value below zero, by its value before the step."""
 
     def locate(self, t: float) -> list[int]:
-        """Shorten the step just made, to time `t` [s], to its first events; their rows."""
+        """Shorten the last step, to time `t` [s], to its first events; returns their rows."""
         return self.find_first()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
-        """The first pair that closes within the step just made, of length `h`, and when [s].
+        """First pair that closes in the last step, of length `h`, and its time [s].
 
-        Those `done` do not count.
+        Pairs in `done` are excluded.
         """
         return None
 
-    def handle(self, found: list[int]) -> Any:
-        """How events, by their rows, end the motion; None if it goes on."""
+    def handle(self, rows: list[int]) -> Any:
+        """Process events, by their rows; returns how they end the motion, None if it continues."""
         return True
 
     @abstractmethod
     def pass_break(self) -> Any:
-        """Go on to the next piece of the torques; how that ends the motion, if it does."""
+        """Enter the next piece of the torques; returns how that ends the motion, or None."""
 
     @property
     def stands(self) -> bool:
-        """Whether nothing moves."""
+        """Whether all velocities are zero."""
         return self.system.is_slower(self.v, STANDING)
 
     def gets_on(self) -> bool:
-        """Count a decision on contact modes; whether some time passes within 60 in a row."""
-        least = 100 * SHORTEST_STEP * self.system.scales.time
-        self.decisions = self.decisions + 1 if self.t - self.decided_at <= least else 0
-        self.decided_at = self.t
+        """Count a choice of contact modes; False after 60 in a row without progress of time."""
+        shortest = 100 * SHORTEST_STEP * self.system.scales.time
+        self.decisions = self.decisions + 1 if self.t - self.decision_time <= shortest else 0
+        self.decision_time = self.t
         return self.decisions <= 60
 
     def tau(self, t: float) -> Array:
-        """Torques at `t`, as if they went on where they step next, shape (2,) [N m]."""
+        """Torques at `t`, extrapolated beyond their next step, shape (2,) [N m]."""
         piece, t = self.piece, min(t, self.breaks[-1])
-        # Ramps between contact modes may be shorter than the time by which modes are judged ahead.
+        # Ramps between contact modes may be shorter than the lookahead of mode choices.
         while t > self.breaks[piece + 1] and piece + 2 < len(self.breaks):
             if self.feedback is not None or self.steps_at[piece + 1]:
                 break
@@ -152,7 +152,7 @@ class Run(ABC):
         return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
 
     def fraction(self, t: float, piece: int | None = None) -> float:
-        """Coordinate of time `t` on the present piece of the torques, from -1 to 1 within it."""
+        """Coordinate of time `t` on the present piece of the torques, in [-1, 1]."""
         first = self.piece if piece is None else piece
         start, stop = self.breaks[first : first + 2]
         return (2 * t - start - stop) / (stop - start)
@@ -163,27 +163,27 @@ class Run(ABC):
         return (start + stop + x * (stop - start)) / 2
 
     def find_torque_steps(self, jumps: Array) -> Flags:
-        """Whether torques step, by their differences between pieces, shape (k, 2) [N m]."""
+        """Whether torques step, (k,), by their jumps between pieces, (k, 2) [N m]."""
         return np.asarray(np.abs(jumps).max(axis=1) > 2e-8 * self.system.scales.torque)
 
     def set_velocity(self, v: Array | float) -> None:
-        """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
-        before = self.system.stored(self.z, self.v)
+        """Set the velocity, shape (n,); the change of kinetic energy counts as impact loss."""
+        energy = self.system.compute_energy(self.z, self.v)
         self.y[self.system.n : 2 * self.system.n] = v
-        self.impact += float(before - self.system.stored(self.z, self.v))
+        self.impact += float(energy - self.system.compute_energy(self.z, self.v))
 
     def project_velocity(self, rows: Array) -> None:
-        """Project the velocity onto rows v = 0, (m, n), in the metric of masses."""
+        """Project the velocity onto rows v = 0, (m, n), in the metric M."""
         root = np.sqrt(self.system.mass)
         scaled = rows / root
         scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
         speed = root * self.v
-        along = scaled @ speed
-        if np.abs(along).max(initial=0.0) > 1e-15 * np.abs(speed).max():
-            self.set_velocity(self.v - np.linalg.lstsq(scaled, along, rcond=1e-9)[0] / root)
+        residual = scaled @ speed
+        if np.abs(residual).max(initial=0.0) > 1e-15 * np.abs(speed).max():
+            self.set_velocity(self.v - np.linalg.lstsq(scaled, residual, rcond=1e-9)[0] / root)
 
     def load(self, modes: Modes) -> None:
-        """Take the steps of some modes from here on, with their signs where they have any."""
+        """Load the compiled steps of some modes, and the signs of these if given."""
         self.modes, degree = modes, self.torque.coefficients.shape[2] - 1
         self.s = build_stepper(self.system.structure, modes._replace(Xi=(), sigma=()), degree)
         self.s.load(self.system, self.tolerance, self.z)
@@ -192,14 +192,14 @@ class Run(ABC):
         self.feed()
 
     def feed(self) -> None:
-        """Hand the present state and torques to the steps."""
+        """Write the present state and torques to the inputs of the steps."""
         inputs = self.s.inputs
         inputs.y[:], inputs.t[:] = self.y, self.t
         inputs.piece[:] = self.torque.breaks[self.piece : self.piece + 2]
         inputs.torque[:] = self.torque.coefficients[self.piece].ravel()
 
     def next_piece(self) -> bool:
-        """Go on to the next piece of the torques, if there is one."""
+        """Enter the next piece of the torques; False at the last one."""
         if self.piece + 2 >= len(self.breaks):
             return False
         self.piece += 1
@@ -219,11 +219,11 @@ class Run(ABC):
             forces = dict(zip(names, last.c_n.tolist(), strict=True))
         self.feedback.begin(self.piece, theta, theta_dot, forces)
         if self.piece:
-            held = self.torque.coefficients[self.piece - 1 : self.piece + 1, :, 0]
-            self.steps_at[self.piece] = bool(self.find_torque_steps(np.diff(held, axis=0))[0])
+            torques = self.torque.coefficients[self.piece - 1 : self.piece + 1, :, 0]
+            self.steps_at[self.piece] = bool(self.find_torque_steps(np.diff(torques, axis=0))[0])
 
     def step_to(self, h: float) -> None:
-        """Repeat the step with another length."""
+        """Repeat the last step with length `h` [s]."""
         self.s.inputs.h[:] = h
         self.s.step()
         self.values = self.measure()
@@ -235,36 +235,36 @@ class Run(ABC):
         self.values = self.measure()
 
     def keep(self, t: float) -> None:
-        """Take the step just made, to time `t` [s], and record its end."""
+        """Accept the last step, to time `t` [s], and record its end."""
         self.t, self.y[:] = t, self.s.outputs.y
         self.s.inputs.y[:], self.s.inputs.t[:] = self.y, t
         self.record()
 
-    def find_first(self, among: slice = slice(None)) -> list[int]:
-        """Shorten the step just made to its first event; rows of `values`.
+    def find_first(self, candidates: slice = slice(None)) -> list[int]:
+        """Shorten the last step to its first event; returns rows of `values`.
 
-        `among` are the rows to look at. That of a pair that closes is its number after these.
+        Only `candidates` are searched. A pair that closes has the row len(values) + its index.
         """
         shift, h = self.shift, float(self.s.inputs.h[0])
-        before, places = np.maximum(self.start + shift, 0.0), np.arange(len(shift))[among]
-        seen, done = list[int](), list[int]()
-        last = -1
+        before, rows = np.maximum(self.start + shift, 0.0), np.arange(len(shift))[candidates]
+        events, located = list[int](), list[int]()
+        latest = -1
         while True:
             if h != self.s.inputs.h[0]:
                 self.step_to(h)
             after = self.values + shift
-            low = [k for k in places[after[places] < 0].tolist() if k not in done]
-            closing = self.find_closing(h, [k - len(shift) for k in done])
-            if not low and closing is None:
-                shown = (after <= self.slack).nonzero()[0].tolist()
-                return [k for k in seen if k == last or k in shown]
-            seen += [k for k in low if k not in seen]
-            share = {k: before[k] / (before[k] - after[k]) for k in low}
-            row = min(low, key=share.__getitem__, default=0)
-            if closing is not None and (not low or closing[1] <= h * share[row]):
-                last, h = len(shift) + closing[0], closing[1]
-                done.append(last)
-                seen.append(last)
+            negative = [k for k in rows[after[rows] < 0].tolist() if k not in located]
+            closing = self.find_closing(h, [k - len(shift) for k in located])
+            if not negative and closing is None:
+                reached = (after <= self.slack).nonzero()[0].tolist()
+                return [k for k in events if k == latest or k in reached]
+            events += [k for k in negative if k not in events]
+            fraction = {k: before[k] / (before[k] - after[k]) for k in negative}
+            row = min(negative, key=fraction.__getitem__, default=0)
+            if closing is not None and (not negative or closing[1] <= h * fraction[row]):
+                latest, h = len(shift) + closing[0], closing[1]
+                located.append(latest)
+                events.append(latest)
                 continue
 
             def value(step: float, row: int = row) -> float:
@@ -273,15 +273,15 @@ class Run(ABC):
 
             ends = float(before[row]), float(after[row])
             h = find_root(value, 0.0, h, ends, self.near, 1e-3 * float(self.slack[row]))
-            done.append(row)
-            last = row
+            located.append(row)
+            latest = row
 
     def move(self) -> Any:
-        """Integrate with the present modes until the contact rule ends the motion; how it does."""
+        """Integrate until the contact rule ends the motion; returns how it ends."""
         while True:
-            while self.wanted[0] <= self.t:
-                self.wanted.popleft()
-            t = self.try_step(min(self.stop, self.wanted[0]))
+            while self.times[0] <= self.t:
+                self.times.popleft()
+            t = self.try_step(min(self.stop, self.times[0]))
             if rows := self.locate(t):
                 self.keep(self.t + float(self.s.inputs.h[0]))
                 ending = self.handle(rows)
@@ -292,74 +292,74 @@ class Run(ABC):
                 return ending
 
     def begin_step(self) -> None:
-        """Start the next step from the state whose event values are known."""
+        """Start the next step: its initial event values are the present ones."""
         self.start = self.values
 
     def try_step(self, target: float) -> float:
-        """Make a step within the tolerance, to `target` [s] at most; when it ends [s]."""
+        """Make a step within the tolerance, at most to `target` [s]; returns its end [s]."""
         remaining, time = target - self.t, self.system.scales.time
         self.begin_step()
-        least = SHORTEST_STEP * max(time, abs(self.t))
+        shortest = SHORTEST_STEP * max(time, abs(self.t))
         while True:
             h = min(self.h, self.longest)
-            whole = h >= 0.999 * remaining
-            h = remaining if whole else min(h, remaining / 2)
+            is_last = h >= 0.999 * remaining
+            h = remaining if is_last else min(h, remaining / 2)
             self.s.inputs.h[:] = h
             self.s.step()
             error = float(self.s.outputs.error[0])
             if error <= 1:
                 self.values = self.measure()
-                # A growth of 40 at order 8 is that of an error of 1e-13 of the tolerance.
-                grown = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
-                self.h = grown if h >= self.h else max(self.h, grown)
+                # Growth by 40 at order 8 corresponds to an error of 1e-13 of the tolerance.
+                longer = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
+                self.h = longer if h >= self.h else max(self.h, longer)
                 self.steps += 1
-                return target if whole else self.t + h
+                return target if is_last else self.t + h
             self.rejected += 1
-            if h < least:
+            if h < shortest:
                 raise StuckError
             self.h = h * max(0.2, 0.9 * error ** (-1 / ORDER)) if error < math.inf else 0.2 * h
 
     def wait(self, stop: float) -> None:
-        """Let time pass at rest."""
-        while self.wanted[0] <= stop:
-            self.t = max(self.t, self.wanted.popleft())
+        """Advance time to `stop` [s] at rest."""
+        while self.times[0] <= stop:
+            self.t = max(self.t, self.times.popleft())
             self.record(still=True)
         self.t = stop
         self.record(still=True)
 
     def when(self) -> str:
-        """Present time, in a sentence."""
+        """Text of the present time."""
         return f"at t = {self.t:.6g} s"
 
     def note(
-        self, kind: EventKind, text: str, contact: str = "", value: float = math.nan, more: str = ""
+        self, kind: EventKind, text: str, contact: str = "", value: float = math.nan, tail: str = ""
     ) -> str:
-        """Append an event at present; its text, which says when, and then `more`."""
-        text = f"{text} {self.when()}{more}"
+        """Append an event; returns its text with the present time and a `tail`."""
+        text = f"{text} {self.when()}{tail}"
         self.events.append(Event(self.t, self.phase_index, kind, text, contact, value))
         return text
 
     def record(self, still: bool = False) -> None:
         """Record the present instant from the outputs of the steps.
 
-        At rest accelerations are zero, and forces are NaN, as they are indeterminate.
+        At rest accelerations are zero, and forces are NaN (indeterminate).
         """
         if not still:
             self.records.append(self.read_outputs(self.t))
             return
-        none, tau = np.full(len(self.modes.kept), math.nan), self.tau(self.t)
-        seen = self.y.copy(), np.zeros(self.system.n), tau, none, none
-        self.records.append(Record(self.t, self.phase_index, self.modes.kept, self.impact, *seen))
+        nan_forces, tau = np.full(len(self.modes.kept), math.nan), self.tau(self.t)
+        values = self.y.copy(), np.zeros(self.system.n), tau, nan_forces, nan_forces
+        self.records.append(Record(self.t, self.phase_index, self.modes.kept, self.impact, *values))
 
     def read_outputs(self, t: float) -> Record:
         """The outputs of the steps as a record at time `t` [s]."""
-        seen: Any = (part.copy() for part in self.s.outputs[:5])
-        return Record(t, self.phase_index, self.modes.kept, self.impact, *seen)
+        values: Any = (part.copy() for part in self.s.outputs[:5])
+        return Record(t, self.phase_index, self.modes.kept, self.impact, *values)
 
 
 @runtime_checkable
 class Law(Protocol):
-    """Torques as a function of what a controller measures."""
+    """Torques as a function of the measurements of a controller."""
 
     @property
     def period(self) -> float:
@@ -367,7 +367,7 @@ class Law(Protocol):
 
     @property
     def delay(self) -> float:
-        """Time after which a sample takes effect; the first one does at once [s]."""
+        """Delay between a sample and its effect; zero for the first one [s]."""
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
@@ -379,7 +379,7 @@ class Law(Protocol):
 
 
 class Feedback:
-    """Sampled torques of a law up to time `until` [s]: `torque` is zero from the present on."""
+    """Sampled torques of a law up to time `until` [s]; future pieces of `torque` are zero."""
 
     def __init__(self, law: Law, until: float) -> None:
         self.law = law
@@ -390,7 +390,7 @@ class Feedback:
         times = times[times < until - SAME * period]
         times = times[np.diff(times, prepend=-np.inf) > SAME * period]
         self._samples = np.zeros((len(ticks), 2))
-        # Rounding must not put an instant before its own sample.
+        # Rounding must not place an instant before its own sample.
         self._latest = np.floor(times / period + SAME).astype(int)
         self._source = np.floor((times - delay) / period + SAME).astype(int).clip(0)
         self.torque = TorqueProfile(np.append(times, until), np.zeros((len(times), 2, 1)))
@@ -398,7 +398,7 @@ class Feedback:
     def begin(
         self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> None:
-        """Sample where one is due at the start of a piece, and set the torques of the piece."""
+        """Sample if due at the start of a piece, and set the torques of the piece."""
         latest = self._latest[piece]
         if piece == 0 or latest > self._latest[piece - 1]:
             t = float(self.torque.breaks[piece])

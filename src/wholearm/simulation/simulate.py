@@ -1,7 +1,7 @@
 """Forward simulation: joint torques in, motion, contact forces and events out.
 
-Event-driven integration (DOP853). The rule that decides on contacts is that of the problem's
-formations (`prescribed`), or that of linear complementarity problems (`complementarity`).
+Event-driven integration (DOP853). Contact modes follow from the formations of the problem
+(`prescribed`), or from linear complementarity problems (`complementarity`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..results.trajectory import Trajectory
 from .events import Energies, Outcome, Simulation, list_stretches
 from .prescribed import Replay
 from .run import Feedback, Law, Run
-from .system import SLOW, Modes, build_system
+from .system import REST_SPEED, Modes, build_system
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
@@ -52,26 +52,26 @@ def simulate(
 
     Parameters
     ----------
-    contacts          prescribed: those of the problem's phases, replayed open loop. Free: none is
-                      assumed, and a loss does not end the simulation; phases count only for the
-                      clock of a plan.
-    tolerance         largest error of each step, in z and z', over those or over the scene's
-                      length, 1 rad, speed and angular speed (`Scene.scales`) where these are more
-    times : (n,) [s]  instants at which the state is wanted; steps end there. Those outside the
-                      torques' time are left out.
+    contacts          prescribed: the contacts of the problem's phases, replayed open loop. Free:
+                      contacts are computed, and a loss does not end the simulation; phases only
+                      follow the clock of a plan.
+    tolerance         largest error of each step in z and z', relative to their size or to the
+                      scene's length, 1 rad, speed and angular speed (`Scene.scales`) if larger
+    times : (n,) [s]  instants at which steps have to end. Instants outside the time range of
+                      the torques are ignored.
 
     With free contacts:
 
-    start : (5,) or (10,)  z, and z' if it is not at rest. What is closer than what counts as
-                           touching is moved onto its contact.
-    until : [s]            the end, if not that of the torques; those of their end hold after it. A
-                           law needs one.
+    start : (5,) or (10,)  z, and z' if not at rest. Gaps smaller than the touching distance are
+                           closed.
+    until : [s]            the end, by default that of the torques; the last torques are held
+                           after it. Required for a law.
     restitution            Poisson's coefficient, 0 for plastic impacts to 1
-    halt                   asked at every event, with the run, whether that is enough
+    halt                   called with the run at every event; True ends the simulation
 
     With prescribed contacts:
 
-    minima    whether to record also where normal forces and friction margins are least within steps
+    minima    whether to record also minima of normal forces and friction margins within steps
     progress  receives a line at the start of each phase
 
     Returns
@@ -90,17 +90,17 @@ def simulate(
         raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    wanted = np.asarray(() if times is None else times, dtype=float)
-    if not np.isfinite(wanted).all():
+    instants = np.asarray(() if times is None else times, dtype=float)
+    if not np.isfinite(instants).all():
         raise InputError("", "times", "holds numbers that are not finite")
-    wanted = sort_unique(wanted)
+    instants = sort_unique(instants)
     if contacts == "prescribed":
         if isinstance(what, Law) or start is not None or until is not None or restitution:
             text = "a law, start, until and restitution need contacts that are free"
             raise InputError("", "contacts", text)
         problem, profile, _ = adopt_torques(problem, what)
         require_phases(problem)
-        run = Replay(problem, profile, tolerance, wanted, minima)
+        run = Replay(problem, profile, tolerance, instants, minima)
         return _conclude(run, problem, *run.play(progress))
     try:
         state = np.asarray(problem.start if start is None else start, dtype=float)
@@ -114,7 +114,7 @@ def simulate(
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     end = None if until is None else require_number(until, "until", positive=True)
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
-    options |= {"wanted": wanted, "halt": halt}
+    options |= {"times": instants, "halt": halt}
     if isinstance(what, Law):
         if end is None:
             raise InputError("", "until", "none given; a law of torques needs an end")
@@ -122,7 +122,7 @@ def simulate(
     problem, profile, plan = adopt_torques(problem, what)
     profile = profile if end is None else profile.cut(0.0, end)
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
-    hint = None if plan is None or start is not None else _recall(problem, plan, 0)
+    hint = None if plan is None or start is not None else _read_modes(problem, plan, 0)
     return _simulate(problem, profile, state, starts, hint, **options)
 
 
@@ -139,18 +139,18 @@ def simulate_phases(
 ) -> Iterator[tuple[range, Simulation]]:
     """Indices and simulations of a plan's phases, each from its planned start, with free contacts.
 
-    Phases that pass into one another in motion, by the plan's velocities, are simulated together.
+    Consecutive phases without rest in between, by the plan's velocities, are simulated together.
     `options` are restitution and tolerance, as of `simulate`.
     """
     starts, system = plan.phase_starts, build_system(problem.scene)
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
-    rests = [row for row in range(1, len(rows)) if system.is_slower(plan.z_dot[rows[row]], SLOW)]
+    rests = [k for k in range(1, len(rows)) if system.is_slower(plan.z_dot[rows[k]], REST_SPEED)]
     for first, stop in pairwise([0, *rests, len(rows)]):
         if progress is not None:
             progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
         profile = plan.torque.cut(float(starts[first]), float(starts[stop]))
         row, clock = rows[first], starts[first:stop].tolist()
-        state, hint = np.append(plan.z[row], plan.z_dot[row]), _recall(problem, plan, row)
+        state, hint = np.append(plan.z[row], plan.z_dot[row]), _read_modes(problem, plan, row)
         yield range(first, stop), _simulate(problem, profile, state, clock, hint, None, **options)
 
 
@@ -183,7 +183,7 @@ def _conclude(
     missed_by: float = math.nan,
     clock: Array | None = None,
 ) -> Simulation:
-    """The result of a run; `clock`: starts of phases that count by time alone [s]."""
+    """The result of a run; `clock`: starts of phases by time alone [s]."""
     system, records = run.system, run.records
     names, n = system.names, system.n
     contacts = [contact.name for contact in problem.contacts]
@@ -191,10 +191,10 @@ def _conclude(
     numbers = [(row.t, row.phase, row.y, row.acceleration, row.tau, row.impact) for row in records]
     t, phase, y, z_ddot, tau, impact = map(np.array, zip(*numbers, strict=True))
     if clock is not None:
-        used = dict.fromkeys(names[pair] for row in records for pair in row.kept)
-        # Contacts that problem files have no name for are among the stretches alone.
+        pressing = dict.fromkeys(names[pair] for row in records for pair in row.kept)
+        # Contacts without a name in problem files occur in the stretches only.
         unnamed = re.compile("tip|joint|.*-(back|joint)")
-        contacts += [n for n in used if n not in contacts and not unnamed.match(n)]
+        contacts += [n for n in pressing if n not in contacts and not unnamed.match(n)]
     forces = np.full((2, len(records), len(names)), np.nan)
     for index, row in enumerate(records):
         forces[:, index, list(row.kept)] = row.c_n, row.c_t
@@ -211,7 +211,7 @@ def _conclude(
         contacts=tuple(contacts),
         c_n=c_n,
         c_t=c_t,
-        energies=Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact),
+        energies=Energies(system.compute_energy(z, z_dot), work, viscous, dry, contact, impact),
         problem=problem,
         torque=run.torque,
         events=tuple(events),
@@ -225,20 +225,20 @@ def _conclude(
     return simulation if clock is None else simulation.count_phases(clock)
 
 
-def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
-    """Contact modes with which a plan begins, for the choice among several solutions."""
+def _read_modes(problem: Problem, plan: Trajectory, row: int) -> Modes:
+    """Initial contact modes of a plan, to select one of several solutions."""
     system = build_system(problem.scene)
     names = [name for name, c in zip(plan.contacts, plan.c_n[row], strict=True) if c == c]
-    if odd := {*names} - {*system.names}:
-        text = f"{', '.join(sorted(odd))} of the plan are not of this scene"
+    if unknown := {*names} - {*system.names}:
+        text = f"{', '.join(sorted(unknown))} of the plan are not of this scene"
         raise InputError("", "contacts", text)
     kept = sorted(system.names.index(name) for name in names)
     z, v, a = plan.z[row], plan.z_dot[row], plan.z_ddot[row]
     rows = system.evaluate(z, v, kept)
-    ahead = 1e-3 * system.scales.time
-    slides = np.sign(rows.A_t @ v + ahead * (rows.A_t @ a + rows.bend_t))
+    dt = 1e-3 * system.scales.time
+    sliding_signs = np.sign(rows.A_t @ v + dt * (rows.A_t @ a + rows.bend_t))
     phase = problem.phases[int(plan.phase[row])]
-    rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
-    Xi = np.where(rolls, 0.0, slides)
-    turns = np.sign(v + ahead * a) * (system.dry > 0)
-    return Modes(tuple(kept), (), tuple(Xi.tolist()), tuple(turns.tolist()))
+    is_rolling = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
+    Xi = np.where(is_rolling, 0.0, sliding_signs)
+    joint_signs = np.sign(v + dt * a) * (system.dry > 0)
+    return Modes(tuple(kept), (), tuple(Xi.tolist()), tuple(joint_signs.tolist()))
