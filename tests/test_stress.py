@@ -15,7 +15,7 @@ from toys import plan_path
 from wholearm import Friction, Phase, PlanOptions, Problem, Trajectory, load
 from wholearm.benchmark import refusals
 from wholearm.benchmark.scenes import draw_case, random_scene
-from wholearm.benchmark.stress import compare_values, look, run_file
+from wholearm.benchmark.stress import check_exit, compare_values, run_file
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
@@ -58,7 +58,7 @@ def test_damaged_files_end_clearly(number: int) -> None:
 def test_what_counts_as_an_unclear_end(
     status: int, out: str, err: str, written: set[str], count: int
 ) -> None:
-    assert len(look(["verify"], status, out, err, written)) == count
+    assert len(check_exit(["verify"], status, out, err, written)) == count
 
 
 def test_values_that_noise_changes_are_found() -> None:
