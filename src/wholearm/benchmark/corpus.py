@@ -1,8 +1,8 @@
 """Regression corpus: answers of the package compared with stored ones.
 
-A case names a family and what that is asked with; families call the public functions alone. Two
-answers agree if kinds, verdicts and contact modes are the same and numbers are within `TOLERANCES`.
-A better value of the objective is no difference, whatever else it changes.
+A case names a family and its arguments; families call public functions only. Two answers agree if
+kinds, verdicts and contact modes are equal and numbers differ by at most `TOLERANCES`. An answer
+with a better value of the objective passes, whatever else differs.
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ VARIANTS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "weak, over time": ("square", {"torque_limit": 0.25}, {}),
     "rough, over time": ("triangle", {"friction": 0.5}, {}),
 }
-"""A problem, changes of it, and options of the planner."""
+"""Variants by name: problem, changes of it, and options of the planner."""
 TUNED = {
     FOUR: ("heptagon_tuned.csv", 0),
     "heptagon": ("heptagon_landing_tuned.csv", 0),
     "hexagon": ("hexagon_tuned.csv", 1),
 }
-"""Problems with torques that `tune` found, and how often it may stop on the way."""
+"""Problems with tuned torques: file, and number of stops allowed in `tune`."""
 SEED = 0
 
 
@@ -100,9 +100,9 @@ def list_cases() -> list[Case]:
 
 
 def answer(case: Case, folder: Path) -> Row:
-    """What the package says to a case, or why it refuses; `folder` has the shipped problems.
+    """Answer of the package to a case, or its refusal; `folder` has the shipped problems.
 
-    Plain values as JSON has them, numbers with nine digits.
+    JSON values, numbers with nine digits.
     """
     family, *arguments = case
     try:
@@ -118,23 +118,23 @@ def _load(folder: Path, name: str) -> Problem:
 
 
 def mask(text: str) -> str:
-    """A message without its numbers, which differ as those of an answer may."""
+    """A message with its numbers masked."""
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", text)
 
 
 def _refuse(error: Exception) -> Row:
-    """Why there is no answer."""
+    """The answer of a refusal."""
     row: Row = {"refused": type(error).__name__, "words": mask(str(error)), "text": str(error)}
-    for short in getattr(error, "shortfalls", ())[:1]:
-        row |= {"short": [short.part, short.kind, short.place.phase], "amount": short.amount}
+    for lack in getattr(error, "shortfalls", ())[:1]:
+        row |= {"short": [lack.part, lack.kind, lack.place.phase], "amount": lack.amount}
     changes = getattr(error, "changes", ())
     return row | {"advice": {change.parameter.key: change.value for change in changes}}
 
 
 def list_modes(plan: Plan) -> list[list[str]]:
-    """Contact modes and directions of the joints that follow each other in every phase.
+    """Sequence of contact modes and joint directions in every phase.
 
-    Those of less than a thousandth of it do not count.
+    Modes shorter than a thousandth of the phase are ignored.
     """
     modes = []
     for phase in plan.phases:
@@ -165,7 +165,7 @@ def _describe_plan(plan: Plan) -> Row:
 
 
 def _verify(problem: Problem, what: Any) -> Row:
-    """The verdict about a plan or torques, and what the replay shows."""
+    """Verdict on a plan or torques, with results of the replay."""
     report = wholearm.verify(problem, what)
     energy = report.energy
     return {
@@ -174,7 +174,7 @@ def _verify(problem: Problem, what: Any) -> Row:
         "failed phase": report.failed_phase,
         "failures": [mask(text) for text in report.failures],
         "arrivals": [phase.arrival for phase in report.phases],
-        "least": [one.value for phase in report.phases if (one := phase.least_force)],
+        "least": [force.value for phase in report.phases if (force := phase.least_force)],
         "events": [change.time for change in report.changes],
         "kinds": [f"{change.phase} {change.what} {change.kind}" for change in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
@@ -198,9 +198,9 @@ def _vary(folder: Path, variant: str) -> Row:
 
 
 def _reach(folder: Path, number: int) -> Row:
-    """A goal of the queries study, with the blocked borders where nothing leads there.
+    """Route to a goal of the queries study, or the refusal.
 
-    From the 40th on it is an edge without x, or now and then an angle.
+    From number 40 on the goal is an edge without x, or sometimes an angle.
     """
     problem = draw_query(SEED, number, folder)
     goal = problem.table["goal"]
@@ -211,7 +211,7 @@ def _reach(folder: Path, number: int) -> Row:
         edge = polygon.flush_angle(flush)
         free = {"flush": flush} if number % 4 else {"phi_deg": np.degrees(edge) + 10.0}
         problem = problem.with_({"goal": free})
-    # What is known of a scene from other goals may lead to another route.
+    # Roadmaps of other goals may lead to another route.
     forget_roadmaps()
     answer = wholearm.find_route(problem)
     phases = [
@@ -235,9 +235,9 @@ def _leg(folder: Path, number: int, objective: str) -> Row:
 
 
 def _simulate_free(folder: Path, name: str) -> Row:
-    """Phases of a plan, each from its planned start, without telling which contacts hold.
+    """Phases of a plan with free contacts, each from its planned start.
 
-    The whole by the clock is not looked at: what rounding does to it grows from phase to phase.
+    The whole simulation by the clock is excluded: rounding errors grow from phase to phase.
     """
     problem = _load(folder, name)
     report = wholearm.verify_free(problem, wholearm.solve(problem))
@@ -254,14 +254,14 @@ def _list_losses(phases: Iterable[Any]) -> list[tuple[int, str, float]]:
     return [(each.number, loss.contact, loss.time) for each in phases for loss in each.losses]
 
 
-def _follow(folder: Path, name: str, share: float) -> Row:
-    """Torques of a file, times a share: up to their first loss of a contact, and simulated free."""
+def _follow(folder: Path, name: str, factor: float) -> Row:
+    """Torques of a file times a factor: verified, and simulated with free contacts."""
     problem = _load(folder, name)
     torque = wholearm.read_torque_csv(str(folder / "torques" / TUNED[name][0]))
-    torque = replace(torque, coefficients=share * torque.coefficients)
+    torque = replace(torque, coefficients=factor * torque.coefficients)
     report = wholearm.verify_free(problem, torque)
     lost = _list_losses(report.phases)
-    # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.
+    # With bouncing contacts, and after the first loss, rounding errors grow from event to event.
     end = min([report.phases[0].stop, *(time for *_, time in lost)]) - 1e-3
     events = [event for event in report.whole.events if event.time < end]
     free = {
@@ -273,10 +273,10 @@ def _follow(folder: Path, name: str, share: float) -> Row:
         "kinds": [f"{event.kind.value} {event.contact}" for event in events],
     }
     try:
-        told = _verify(problem, torque)
+        verdict = _verify(problem, torque)
     except wholearm.WholearmError as error:
-        told = _refuse(error)
-    return {"free": free, "told": told}
+        verdict = _refuse(error)
+    return {"free": free, "told": verdict}
 
 
 def _tune(folder: Path, name: str) -> Row:
@@ -298,8 +298,8 @@ def _predict(folder: Path, name: str) -> Row:
             "kept": phase.is_kept,
             "first": "" if phase.slow is None else phase.slow.name,
             "least": None if phase.slow is None else phase.slow.force,
-            "speeds": [one.speed for one in phase.survivals],
-            "breaks": [f"{one.motion}: {one.first.name}" for one in phase.survivals],
+            "speeds": [survival.speed for survival in phase.survivals],
+            "breaks": [f"{survival.motion}: {survival.first.name}" for survival in phase.survivals],
         }
         for phase in wholearm.predict(_load(folder, name)).phases
     ]
@@ -307,7 +307,7 @@ def _predict(folder: Path, name: str) -> Row:
 
 
 def _control(folder: Path, name: str) -> Row:
-    """The policy of a least-time plan, and what becomes of its phases."""
+    """The policy of a least-time plan, and the outcome of its phases."""
     problem = _load(folder, name)
     plan = wholearm.solve(problem)
     policy = wholearm.make_policy(problem, plan)
@@ -334,18 +334,18 @@ def _assess(folder: Path, name: str) -> Row:
 
 def _compare(folder: Path, name: str) -> Row:
     problem = _load(folder, name)
-    with tempfile.TemporaryDirectory() as place:
-        path = str(Path(place, "plan.npz"))
+    with tempfile.TemporaryDirectory() as directory:
+        path = str(Path(directory, "plan.npz"))
         wholearm.solve(problem).save(path)
         comparison = wholearm.compare(problem, [path, str(folder / "torques" / TUNED[name][0])])
-    names = {"ok": "ok", "durations": "duration", "efforts": "effort", "margins": "margin"}
-    names |= {"losses": "lost", "peaks": "peaks", "simulations": "simulations"}
-    # Of contacts that keep epsilon exactly rounding decides which one presses least.
+    attributes = {"ok": "ok", "durations": "duration", "efforts": "effort", "margins": "margin"}
+    attributes |= {"losses": "lost", "peaks": "peaks", "simulations": "simulations"}
+    # Among contacts with c_n = epsilon rounding decides which one is the smallest.
     contacts = [
         f"{each.contact} in phase {each.phase}" if (each.margin or 0.0) > 1e-5 else "several"
         for each in comparison.contenders
     ]
-    return _collect(comparison.contenders, **names) | {"contacts": contacts}
+    return _collect(comparison.contenders, **attributes) | {"contacts": contacts}
 
 
 def _collect(items: Sequence[Any], **names: str) -> Row:
@@ -354,11 +354,11 @@ def _collect(items: Sequence[Any], **names: str) -> Row:
 
 
 def _report(folder: Path, name: str) -> Row:
-    """Numbers in the tables of a report of a plan and of torques, but for how long it took."""
+    """Numbers in the tables of a report of a plan and of torques, without timings."""
     from ..__main__ import start
 
-    with tempfile.TemporaryDirectory() as place:
-        path, page = str(Path(place, "plan.npz")), Path(place, "page.html")
+    with tempfile.TemporaryDirectory() as directory:
+        path, page = str(Path(directory, "plan.npz")), Path(directory, "page.html")
         wholearm.solve(_load(folder, name)).save(path)
         torques = str(folder / "torques" / TUNED[name][0])
         status = start(["report", str(folder / f"{name}.toml"), path, torques, "-o", str(page)])
@@ -385,13 +385,13 @@ def _draw_map(folder: Path, name: str) -> Row:
 
 
 def _count(formations: Iterable[Iterable[object]]) -> list[Any]:
-    """How many formations there are, and a digest of their names."""
+    """Number of formations, and a digest of their names."""
     names = sorted(" ".join(map(str, formation)) for formation in formations)
     return [len(names), f"{crc32(' '.join(names).encode()):08x}"]
 
 
 def _list(folder: Path, number: int) -> Row:
-    """Formations along a route: that of the documentation first, then those of legs."""
+    """Formations along a route: number 0 is that of the documentation, others are legs."""
     if number == 0:
         problem = _load(folder, FOUR)
         places = (0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)
@@ -408,7 +408,7 @@ def _list(folder: Path, number: int) -> Row:
 
 
 def count(problem: Problem) -> dict[str, int]:
-    """Plan a problem for least time, replay the plan, and count what that takes.
+    """Work of a least-time plan and its replay: sizes, iterations, evaluations.
 
     Sizes are those of the first NLP of each block, such as "phase 5-6 of 6: rows".
     """
@@ -452,16 +452,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def _read(folder: Path, number: int) -> Row:
-    """A problem file with another entry."""
+    """Reading of a problem file with a changed entry."""
     table = copy.deepcopy(BASE)
     change = change_tree(np.random.default_rng([SEED, number]), table, STRANGE)
     return {"change": change} | _try(wholearm.load, "problem.toml", write_toml(table).encode())
 
 
 def _try(work: Callable[[str], object], name: str = "none", content: bytes = b"") -> Row:
-    """Whether work on a file is refused, by a message that does not name its folder."""
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, name)
+    """Whether `work` on a file is refused, and the message without its folder."""
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory, name)
         path.write_bytes(content)
         try:
             work(str(path))
@@ -476,7 +476,7 @@ def _ask(folder: Path, name: str) -> Row:
 
 
 def _read_torques(folder: Path, number: int) -> Row:
-    """A table of torques with another entry."""
+    """Reading of a table of torques with a changed entry."""
     rng = np.random.default_rng([SEED, number])
     change, content = damage_torques(rng, b"t,tau1,tau2\n0,0,0\n0.5,1,0\n1,0,0\n")
 
@@ -508,7 +508,7 @@ FAMILIES: dict[str, tuple[Callable[..., Row], list[Case]]] = {
     "option": (_ask, [*zip(OPTIONS)]),
     "torque file": (_read_torques, [*zip(range(10))]),
 }
-"""What families ask, and with which arguments; first those that take long, so that processes end
+"""Families: function and list of arguments. Long ones come first, so that processes end
 together."""
 
 
@@ -516,23 +516,23 @@ TOLERANCES = {
     "value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "least": 1e-3, "margins": 1e-3,
     "stops": 2e-3,
 }  # fmt: skip
-"""Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
+"""Relative to the largest number of an entry: accuracy of Ipopt and of the refinement of limits.
 
-An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
+An amount is the shortfall in a relaxed problem, advice the result of a bisection. Numbers of a
 report have four digits; a least force or margin is one at an instant. Phases of a policy stop at
 samples, 1 ms apart in simulations of more than 1 s.
 """
-USUAL = 1e-4  # for all others: the accuracy that plans are made with
-LOCAL = ("plan over time", "goal", "scene", "leg")
-"""Families whose optimum need not be the only one: values agree within `USUAL`.
+DEFAULT = 1e-4  # of all other entries: the accuracy of plans
+LOCAL_OPTIMA = ("plan over time", "goal", "scene", "leg")
+"""Families with several local optima: values agree within `DEFAULT`.
 
-Values are flat at an optimum: motions whose values differ by `USUAL` differ by its root.
+Near an optimum, motions whose values differ by `DEFAULT` differ by its root.
 """
-WORDS = ("words", "text", "advice", "help", "reason")
-"""Entries that do not count as an answer: words, and advice, which ends by processor time."""
-COUNTED = ("goals", "kept")  # entries that count samples
+TEXT_KEYS = ("words", "text", "advice", "help", "reason")
+"""Entries without influence on the verdict: texts, and advice limited by processor time."""
+SAMPLE_COUNTS = ("goals", "kept")  # entries that are numbers of samples
 BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1, "panels of curves": 1.25}
-"""Largest ratio to the stored counts of those in which rounding has a part; others may not grow.
+"""Largest ratio to stored counts that depend on rounding; other counts must not grow.
 
 Over five kernels of OpenBLAS, five seeds of changes in the last bits and NumPy 2.1 to 2.5,
 iterations differ by 1 %, evaluations by 0.5 %, and panels by one.
@@ -540,11 +540,11 @@ iterations differ by 1 %, evaluations by 0.5 %, and panels by one.
 
 
 class Corpus(Study):
-    """Answers of today against stored ones."""
+    """Comparison of new answers with stored ones."""
 
     name, title = "corpus", "Answers against stored ones"
     keys = ("family",)
-    folder, shipped = "build", True
+    folder, needs_problems = "build", True
     problems, rounding = Path("problems"), 0
     options = """\
 --only PATTERN ...  cases whose names match, such as 'plan heptagon *' (all)
@@ -557,13 +557,13 @@ class Corpus(Study):
 """
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
-        """How numbers are rounded, and source, problems and machine that records are of."""
+        """Kernel, rounding, and a digest of source, problems and machine."""
         source = digest_source(sorted(Path(options.problems).glob("*.toml")))
         kernel = os.environ.get("OPENBLAS_CORETYPE")
         return {"kernel": kernel, "rounding": options.rounding, "source": source}
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """Those that are asked for."""
+        """Cases selected by `--only`."""
         self.problems, self.rounding = Path(options.problems), options.rounding
         for case in list_cases():
             if any(fnmatch(name_case(case), pattern) for pattern in options.only or "*"):
@@ -574,13 +574,13 @@ class Corpus(Study):
         return 300.0 if case[0] == "tune" else 120.0
 
     def run(self, case: Case) -> Row:
-        """Ask."""
+        """Compute the answer of a case."""
         if self.rounding:
             perturb_scenes(self.rounding)
         return {"answer": answer(case, self.problems)}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
-        """How many answers of each family are the same, and which differ; or they are stored."""
+        """Numbers of equal and different answers by family; stores them on `--update`."""
         new = options.update and not Path(options.answers).exists()
         stored = {} if new else read_json(options.answers)
         if options.update:
@@ -589,55 +589,55 @@ class Corpus(Study):
             lines = [f"{json.dumps(name)}: {json.dumps(stored[name])}" for name in names]
             write_text(options.answers, "{\n" + ",\n".join(lines) + "\n}\n")
         kinds = ("same", "better", "other words", "differs")
-        table, others, wrong = list[list[Any]](), list[str](), list[str]()
-        for family, mine in group(rows, "family").items():
+        table, remarks, failures = list[list[Any]](), list[str](), list[str]()
+        for family, family_rows in group(rows, "family").items():
             count = Counter[str]()
-            for row in mine:
+            for row in family_rows:
                 pair = row["answer"], stored.get(row["name"])
                 kind, texts = compare(family, *(map(_reduce, pair) if options.values else pair))
                 count[kind] += 1
                 if kind == "differs":
-                    wrong += [f"{row['name']}: {text}" for text in texts[:3]]
+                    failures += [f"{row['name']}: {text}" for text in texts[:3]]
                 elif texts:
-                    others.append(f"* {kind}: {row['name']}: {texts[0]}")
-            seconds = sum(row["seconds"] for row in mine)
-            table.append([family, len(mine), *(count[kind] for kind in kinds), seconds])
+                    remarks.append(f"* {kind}: {row['name']}: {texts[0]}")
+            seconds = sum(row["seconds"] for row in family_rows)
+            table.append([family, len(family_rows), *(count[kind] for kind in kinds), seconds])
         table.append(["all", *map(sum, zip(*(line[1:] for line in table), strict=True))])
         heads = ["family", *(f"{name}:d" for name in ("cases", *kinds)), "processor time [s]:.0f"]
-        return [Table(heads, table), "\n".join(others)], wrong
+        return [Table(heads, table), "\n".join(remarks)], failures
 
 
 STUDY = Corpus()
 
 
-def compare(family: str, found: Any, stored: Any) -> tuple[str, list[str]]:
-    """Whether an answer is as stored: same, better, other words, or differs; and where."""
+def compare(family: str, new: Any, stored: Any) -> tuple[str, list[str]]:
+    """Kind of agreement with a stored answer, and the differences."""
     if stored is None:
         return "differs", ["no answer is stored; --update stores it"]
     if family == "counts":
-        grown = [f"{key} is counted in one of them alone" for key in found.keys() ^ stored.keys()]
-        for key in found.keys() & stored.keys():
-            if found[key] > (most := stored[key] * BANDS.get(key, 1.0)):
-                text = f"{key} has grown from {stored[key]} to {found[key]}"
-                grown.append(f"{text} (allowed: {most:.0f})" if key in BANDS else text)
-        return ("differs", sorted(grown)) if grown else ("same", [])
-    if "value" in found and found["objective"] == stored.get("objective"):
-        gain = found["value"] / stored["value"] - 1
+        changes = [f"{key} is counted in one of them alone" for key in new.keys() ^ stored.keys()]
+        for key in new.keys() & stored.keys():
+            if new[key] > (bound := stored[key] * BANDS.get(key, 1.0)):
+                text = f"{key} has grown from {stored[key]} to {new[key]}"
+                changes.append(f"{text} (allowed: {bound:.0f})" if key in BANDS else text)
+        return ("differs", sorted(changes)) if changes else ("same", [])
+    if "value" in new and new["objective"] == stored.get("objective"):
+        gain = new["value"] / stored["value"] - 1
         gain = gain if stored["objective"] == "margin" else -gain
-        holds = found["replay"]["ok"] >= stored["replay"]["ok"]
-        if gain > _allowed(family, "value") and holds:
-            return "better", [f"value {found['value']:.9g} instead of {stored['value']:.9g}"]
-    if "refused" in stored and found.get("replay", {}).get("ok"):
-        return "better", [f"value {found['value']:.9g} instead of a refusal"]
-    texts = list(_differ(family, "", found, stored))
+        is_valid = new["replay"]["ok"] >= stored["replay"]["ok"]
+        if gain > _allowed(family, "value") and is_valid:
+            return "better", [f"value {new['value']:.9g} instead of {stored['value']:.9g}"]
+    if "refused" in stored and new.get("replay", {}).get("ok"):
+        return "better", [f"value {new['value']:.9g} instead of a refusal"]
+    texts = list(_differ(family, "", new, stored))
     if not texts:
         return "same", []
-    strong = [text for weak, text in texts if not weak]
-    return ("differs", strong) if strong else ("other words", [text for _, text in texts])
+    failures = [text for is_text, text in texts if not is_text]
+    return ("differs", failures) if failures else ("other words", [text for _, text in texts])
 
 
 def _reduce(answer: Any) -> Any:
-    """Verdict, value and contact modes of a plan, or its refusal; other answers as they are."""
+    """Verdict, value and contact modes of a plan, or its refusal; other answers unchanged."""
     if not answer or not {"replay", "refused"} & answer.keys():
         return answer
     keys = ("refused", "objective", "value", "modes")
@@ -646,35 +646,35 @@ def _reduce(answer: Any) -> Any:
 
 
 def _allowed(family: str, key: str) -> float:
-    if family not in LOCAL:
-        return TOLERANCES.get(key, USUAL)
-    return USUAL if key == "value" else max(TOLERANCES.get(key, 0.0), math.sqrt(USUAL))
+    if family not in LOCAL_OPTIMA:
+        return TOLERANCES.get(key, DEFAULT)
+    return DEFAULT if key == "value" else max(TOLERANCES.get(key, 0.0), math.sqrt(DEFAULT))
 
 
-def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bool, str]]:
-    """Whether a difference is one of words, and what it is, for each entry."""
-    if isinstance(found, Mapping) and isinstance(stored, Mapping):
-        for name in dict.fromkeys([*stored, *found]):
-            subkey = key if key in WORDS else name
-            for weak, text in _differ(family, subkey, found.get(name), stored.get(name)):
-                yield weak, f"{name}: {text}"
+def _differ(family: str, key: str, new: Any, stored: Any) -> Iterator[tuple[bool, str]]:
+    """Differences of entries: (whether only in texts, description)."""
+    if isinstance(new, Mapping) and isinstance(stored, Mapping):
+        for name in dict.fromkeys([*stored, *new]):
+            subkey = key if key in TEXT_KEYS else name
+            for is_text, text in _differ(family, subkey, new.get(name), stored.get(name)):
+                yield is_text, f"{name}: {text}"
         return
-    leaves, others = _list_leaves(found), _list_leaves(stored)
-    if len(leaves) == len(others) and {*map(type, leaves + others)} <= {int, float}:
-        off = max(abs(a - b) for a, b in zip(leaves, others, strict=True))
-        scale = max(map(abs, leaves + others))
-        # One sample at the edge of what a plan bears may end otherwise.
-        if off > (1 if key in COUNTED else _allowed(family, key) * scale):
-            yield key in WORDS, f"{_show(found)}, stored {_show(stored)}, off by {off:.2g}"
-    elif isinstance(found, list) and isinstance(stored, list) and len(found) == len(stored):
-        for one, other in zip(found, stored, strict=True):
-            yield from _differ(family, key, one, other)
-    elif found != stored:
-        yield key in WORDS, f"{_show(found)}, stored {_show(stored)}"
+    leaves, stored_leaves = _list_leaves(new), _list_leaves(stored)
+    if len(leaves) == len(stored_leaves) and {*map(type, leaves + stored_leaves)} <= {int, float}:
+        deviation = max(abs(a - b) for a, b in zip(leaves, stored_leaves, strict=True))
+        scale = max(map(abs, leaves + stored_leaves))
+        # One sample close to the limits of a plan may have another outcome.
+        if deviation > (1 if key in SAMPLE_COUNTS else _allowed(family, key) * scale):
+            yield key in TEXT_KEYS, f"{_show(new)}, stored {_show(stored)}, off by {deviation:.2g}"
+    elif isinstance(new, list) and isinstance(stored, list) and len(new) == len(stored):
+        for a, b in zip(new, stored, strict=True):
+            yield from _differ(family, key, a, b)
+    elif new != stored:
+        yield key in TEXT_KEYS, f"{_show(new)}, stored {_show(stored)}"
 
 
 def _list_leaves(value: Any) -> list[Any]:
-    """What nested lists hold, among it empty ones, or the value itself."""
+    """Leaves of nested lists, empty lists included, or the value itself."""
     return [*chain(*map(_list_leaves, value))] if value and isinstance(value, list) else [value]
 
 
@@ -687,10 +687,10 @@ LARGEST = 4  # largest change of a number, in units of 2^-52 of it
 
 
 def perturb_scenes(seed: int) -> None:
-    """Multiply every number of each scene that is made from now on by 1 + k 2^-52, |k| <= 4.
+    """Multiply all numbers of scenes created from now on by 1 + k 2^-52, |k| <= 4.
 
-    k follows from the seed, the name of the number and its first 14 digits, to which the number
-    is rounded first. So a scene that is made again from its own numbers keeps them.
+    Numbers are first rounded to 14 digits. k is a hash of the seed, the name of the number and
+    these digits, so a scene created again from its own numbers keeps them.
     """
 
     def change(kind: Any) -> None:
@@ -698,10 +698,10 @@ def perturb_scenes(seed: int) -> None:
         names = [field.name for field in fields(kind) if field.init and field.name != "name"]
 
         def check_and_perturb(self: Any) -> None:
-            # First as they were given: messages about bad numbers quote them.
-            given = {name: getattr(self, name) for name in names}
+            # Original values are checked first: messages quote them.
+            values = {name: getattr(self, name) for name in names}
             check(self)
-            for name, value in given.items():
+            for name, value in values.items():
                 label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
                 changed = None if value is None else _change(getattr(self, name), label)
                 object.__setattr__(self, name, changed)
@@ -717,9 +717,9 @@ def perturb_scenes(seed: int) -> None:
 def _change(value: Any, label: str) -> Any:
     if isinstance(value, bool) or not isinstance(value, Real | np.ndarray):
         return value
-    given = np.asarray(value, dtype=float)
-    changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(given)]
-    return np.array(changed).reshape(given.shape) if given.ndim else changed[0]
+    array = np.asarray(value, dtype=float)
+    changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(array)]
+    return np.array(changed).reshape(array.shape) if array.ndim else changed[0]
 
 
 @cache

@@ -1,7 +1,7 @@
 """How cost and memory grow with intervals, phases and vertices, with exponents.
 
-Each size is measured in a process of its own. The exponent is the slope of a straight line through
-the larger half of the sizes on logarithmic axes, where what does not grow no longer counts.
+Each size is measured in a new process. The exponent is the slope of a straight line through the
+larger half of the sizes on logarithmic axes, where constant costs are negligible.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ WORK = {
     "phases": (("least time",), (3, 6, 12, 25, 50)),
     "vertices": (("reading", "map"), (6, 12, 25, 50, 100)),
 }
-"""What grows, kinds of work that are measured, and sizes."""
+"""Varied quantity, kinds of work, and sizes."""
 FIELDS = {"seconds": ("s", "processor time [s]"), "memory": ("MB", "rise of memory [MB]")}
 """Quantities that are measured, their units and labels."""
 
 
 class Growth(Study):
-    """Cost of one problem's work, made as large as is asked."""
+    """Cost of work on one problem, by size."""
 
     name, title, timed = "growth", "How cost and memory grow", True
-    alone = True
+    isolated = True
     keys = ("problem", "grows", "work", "size")
     columns = (*keys[1:], "seconds", "memory")
     options = "problem  problem file (TOML) whose first phase is made larger\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """What grows, what is done, and the size."""
+        """Problem, varied quantity, work and size."""
         load(options.problem)
         for grows, (works, sizes) in WORK.items():
             yield from product([options.problem], [grows], works, sizes)
@@ -96,13 +96,13 @@ STUDY = Growth()
 
 
 def select(rows: Sequence[Row], grows: str, work: str, field: str) -> tuple[list[int], list[float]]:
-    """Sizes, and what some work has cost at them; what is nothing counts as little."""
-    mine = group(rows, "grows", "work").get((grows, work), [])
-    return [row["size"] for row in mine], [max(row[field], 1e-3) for row in mine]
+    """Sizes and costs of some work; costs are at least 1e-3."""
+    selected = group(rows, "grows", "work").get((grows, work), [])
+    return [row["size"] for row in selected], [max(row[field], 1e-3) for row in selected]
 
 
 def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
-    """Do one piece of work on the problem of a table, made as large as is asked."""
+    """Do one piece of work on the problem of a table with a given size."""
     (first, *_) = table["phases"]
     if grows == "vertices":
         angles = 2 * np.pi * np.arange(size) / size

@@ -679,7 +679,7 @@ class Precision(Study):
     name, title, timed = "precision", "Run time against error, with peers", True
     keys = ("study", "phase", "method", "setting")
     columns = (*keys, "build", "solve", "errors", "outcome")
-    shipped = True
+    needs_problems = True
     allowed = 60.0
     options = """\
 --peers NAME ...  measure these methods only, by the names that the table has (all)

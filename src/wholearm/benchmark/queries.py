@@ -46,7 +46,7 @@ class Queries(Study):
     """Queries, second ones on the same map, and routes carried out."""
 
     name, title = "queries", "From pose to pose"
-    shipped = seeded = True
+    needs_problems = seeded = True
     options = f"""\
 --queries N   how many = 250 in 0..100000
 --polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..100000

@@ -1,6 +1,6 @@
-"""Cost of each part of the model: the same phases with it and without it.
+"""Cost of each part of the model: the same phases with and without it.
 
-A part that a scene does not have adds no unknowns and no rows, and its code is not run.
+A part absent from a scene adds no unknowns and no rows, and its code does not run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Skip(Study):
     """Plans without a part of the model and with it."""
 
     name, title, timed = "skip", "What each part costs", True
-    alone = shipped = True
+    isolated = needs_problems = True
     keys = ("problems", "part", "having")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
@@ -44,8 +44,8 @@ class Skip(Study):
 
     def run(self, case: Case) -> Row:
         """Plan once."""
-        folder, part, having, _ = case
-        return list_pairs(folder)[part][having]()
+        folder, part, included, _ = case
+        return list_pairs(folder)[part][included]()
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
         """Sizes, and medians of times."""
@@ -68,16 +68,15 @@ STUDY = Skip()
 
 
 def list_pairs(folder: str, **options: Any) -> dict[str, tuple[partial[Row], partial[Row]]]:
-    """What the same phases cost without each part of the model and with it, by the part's name.
+    """Calls of `spend` without and with each part of the model, by the part's name.
 
-    Each is to be measured by `spend`. Problems are made of those in a folder; `options` are those
-    of `solve`.
+    Problems derive from those in `folder`; `options` are those of `solve`.
     """
-    whole, box, joined = (
+    base, box, impacts = (
         load(str(Path(folder) / f"{name}.toml"))
         for name in ("heptagon_four_contacts", "box_rolling", "heptagon_impact")
     )
-    slide = build_problem({**whole.table, "phases": whole.table["phases"][:1]}, whole.source)
+    slide = build_problem({**base.table, "phases": base.table["phases"][:1]}, base.source)
     tip = _pick(box, 1, 2)
     path, over_time = options, options | {"transcription": "time"}
     problems = {
@@ -94,11 +93,11 @@ def list_pairs(folder: str, **options: Any) -> dict[str, tuple[partial[Row], par
     sliding = replace(phase, formation=replace(phase.formation, rolling=()))
     slipping = replace(tip, phases=(sliding,))
     both = replace(slide, phases=(replace(slide.phases[0], until=Until(None, "x", 0.03)),))
-    held = both.phases[0].formation
-    alone = replace(both.phases[0], formation=replace(held, contacts=held.contacts[:-1]))
+    formation = both.phases[0].formation
+    single = replace(both.phases[0], formation=replace(formation, contacts=formation.contacts[:-1]))
     # The idle finger is turned away.
-    idle = replace(both, start=both.start + np.array([0, 0, 0, 0, 0.6]), phases=(alone,))
-    run = _pick(joined, 0, 2)
+    idle = replace(both, start=both.start + np.array([0, 0, 0, 0, 0.6]), phases=(single,))
+    run = _pick(impacts, 0, 2)
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
     problems |= {
         "a rolling contact, over time": (slipping, tip, over_time),
@@ -114,7 +113,7 @@ def list_pairs(folder: str, **options: Any) -> dict[str, tuple[partial[Row], par
 
 
 def _pick(problem: Problem, first: int, stop: int) -> Problem:
-    """Some phases of a problem, the last of which ends at rest."""
+    """A range of phases of a problem; the last one ends at rest."""
     start = trace_phases(problem)[first - 1].end if first else problem.start
     phases = [replace(phase, index=k) for k, phase in enumerate(problem.phases[first:stop])]
     phases[-1] = replace(phases[-1], end=End.REST)
@@ -124,12 +123,12 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
 def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
     """Sizes of the first NLP of a plan, and processor time outside and inside the solver [s].
 
-    It is that of planning, with options of `solve`, and of drawing the plan if that is asked for.
+    Time includes planning, with options of `solve`, and drawing the plan if `draw`.
     """
     started = time.process_time()
     with open_ledger() as ledger:
         if options.get("transcription") == "time":
-            # Not from the plan along curves, whose NLPs are others.
+            # Not from the plan along curves, which solves other NLPs.
             plan_phases(problem, problem.phases, problem.start, PlanOptions(**options))
         else:
             solution = solve(problem, replay=False, **options)
@@ -137,6 +136,6 @@ def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
         from ..figures.plots import force_margins
 
         force_margins(solution).canvas.draw()
-    whole, solving = time.process_time() - started, sum(run.seconds for run in ledger.runs)
+    total, solving = time.process_time() - started, sum(run.seconds for run in ledger.runs)
     sizes = ledger.runs[0].unknowns, ledger.runs[0].rows
-    return dict(zip(COLUMNS, (*sizes, whole - solving, solving), strict=True))
+    return dict(zip(COLUMNS, (*sizes, total - solving, solving), strict=True))

@@ -1,7 +1,7 @@
-"""A study: cases, what comes of each, and a table of all.
+"""A study: cases, the result of each, and a table.
 
-`run_study` runs the cases in processes, each within its processor time, keeps what comes of them
-as they end, goes on where it was stopped, and writes the table with versions and machine.
+`run_study` runs the cases in processes with limits of processor time, records each result at once,
+resumes after an interruption, and writes the table with versions and machine.
 """
 
 from __future__ import annotations
@@ -33,44 +33,44 @@ from ..common.parallel import Journal, Processes, run_all
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Case = tuple[Any, ...]  # plain values that say what is run: the name of its record, too
+Case = tuple[Any, ...]  # plain values that identify a case, also in its record
 Row = dict[str, Any]
-"""What came of a case, as plain values; `findings` is what must not be.
+"""Result of a case, as plain values; `findings` lists its failures.
 
-Added are `case`, the entries that have names, `name`, the `seconds` of processor time, and
-`memory`, by which it has raised the peak of its process [MB].
+`run_study` adds `case`, its entries named by `Study.keys`, `name`, the processor time `seconds` and
+`memory`, the rise of peak memory of the process [MB].
 """
 Findings = tuple[Sequence[str | Table], list[str]]
-PACKAGES = ("casadi", "numpy", "scipy", "toppra", "yapss")  # those that are there are stated
+PACKAGES = ("casadi", "numpy", "scipy", "toppra", "yapss")  # packages stated with version
 
 
 class Study:
     """Cases, a run of one of them, and a table."""
 
     name = title = ""  # of its files, ``bench_NAME.jsonl``, ``.md`` and ``.csv``; of the table
-    folder = "results"  # where, if the command line does not say
-    timed = alone = False  # whether cases are run one at a time, and each in a process of its own
+    folder = "results"  # default output folder
+    timed = isolated = False  # whether cases run one at a time; each in a new process
     strict = False  # whether warnings are errors
-    shipped = seeded = False  # whether it reads problem files; whether cases are drawn from a seed
-    keys: tuple[str, ...] = ()  # names of the first entries of cases, as rows have them
-    columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
-    options = ""  # table of options beside those that every study has, as of `read_options`
+    needs_problems = seeded = False  # whether it reads problem files; whether it draws cases
+    keys: tuple[str, ...] = ()  # names of the first entries of cases in rows
+    columns: tuple[str, ...] = ()  # entries of rows in the CSV file; empty for no file
+    options = ""  # table of further options, in the format of `read_options`
 
     def list_options(self) -> str:
         """The table of all options."""
         parts = {
             self.options: True,
             "--jobs N  processes (as many as cores) in 1..256\n": not self.timed,
-            "--problems DIR  folder of problem files = problems\n": self.shipped,
+            "--problems DIR  folder of problem files = problems\n": self.needs_problems,
             f"--seed K  of everything drawn = 0 in 0..{2**63}\n": self.seeded,
             "--fresh  run all cases anew, whatever records the folder has\n": True,
             "--again  run again the cases that had findings\n": True,
             f"-o --output DIR  folder for records and tables = {self.folder}\n": True,
         }
-        return "".join(text for text, has in parts.items() if has)
+        return "".join(text for text, included in parts.items() if included)
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
-        """What records belong to, beside study and version: a seed, for example."""
+        """Identity of records beside study and version, for example a seed."""
         return {}
 
     def list_cases(self, options: argparse.Namespace) -> Iterable[Case]:
@@ -78,11 +78,11 @@ class Study:
         raise NotImplementedError
 
     def run(self, case: Case) -> Row:
-        """Run one case, in another process."""
+        """Run one case, in a worker process."""
         raise NotImplementedError
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
-        """Texts and tables, and what must not be; cases that have failed are not in `rows`."""
+        """Texts and tables, and findings; `rows` excludes failed cases."""
         raise NotImplementedError
 
     def draw(self, rows: Sequence[Row]) -> Figure | None:
@@ -95,12 +95,12 @@ class Study:
 
 
 def name_case(case: Iterable[Any]) -> str:
-    """A case in words."""
+    """Text of a case."""
     return " ".join(map(str, case))
 
 
 def group(rows: Iterable[Row], *keys: str) -> dict[Any, list[Row]]:
-    """Rows by one of their entries, or by several, in the order in which these come first."""
+    """Rows by one or several of their entries, in order of first occurrence."""
     groups, find = dict[Any, list[Row]](), itemgetter(*keys)
     for row in rows:
         groups.setdefault(find(row), []).append(row)
@@ -110,9 +110,9 @@ def group(rows: Iterable[Row], *keys: str) -> dict[Any, list[Row]]:
 def run_study(
     study: Study, options: argparse.Namespace, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[str, list[str], list[str]]:
-    """Run a study, or what is left of it, and write its table.
+    """Run the remaining cases of a study, and write its table.
 
-    Returns its text, what must not be, and the files it has written.
+    Returns its text, the findings, and the files written.
     """
     cases = list(dict.fromkeys(study.list_cases(options)))
     make_folder(options.output)
@@ -120,27 +120,27 @@ def run_study(
     stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
     with Journal(f"{stem}.jsonl", stamp, options.fresh, options.again) as journal:
         done = {json.dumps(row["case"]): row for row in journal.records}
-        left = [case for case in cases if json.dumps(case) not in done]
-        wall_start, wrong = time.monotonic(), 0
+        remaining = [case for case in cases if json.dumps(case) not in done]
+        wall_start, n_findings = time.monotonic(), 0
         # Each process has one thread of OpenBLAS.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        jobs = min(1 if study.timed else options.jobs or os.cpu_count() or 1, len(left) or 1)
-        pool = Processes(jobs, study.limit, study.alone)
-        answers = run_all(partial(measure_case, study), left, pool, jobs)
+        jobs = min(1 if study.timed else options.jobs or os.cpu_count() or 1, len(remaining) or 1)
+        pool = Processes(jobs, study.limit, study.isolated)
+        answers = run_all(partial(measure_case, study), remaining, pool, jobs)
         for count, (case, answer) in enumerate(answers, start=1):
             row = _fail(str(answer)) if isinstance(answer, Exception) else answer
             done[json.dumps(case)] = row = {"case": list(case), **row}
             journal.add(row)
-            wrong += bool(row.get("findings"))
-            ahead = (time.monotonic() - wall_start) / count * (len(left) - count) / 60
-            text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
-            progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
+            n_findings += bool(row.get("findings"))
+            minutes = (time.monotonic() - wall_start) / count * (len(remaining) - count) / 60
+            text = f"{study.name}: {len(cases) - len(remaining) + count} of {len(cases)} cases"
+            progress(f"{text}, {n_findings} with findings, {minutes:.0f} min left")
     rows = [
         dict(zip(study.keys, case, strict=False), name=name_case(case)) | done[json.dumps(case)]
         for case in cases
     ]
-    good = [row for row in rows if "failed" not in row]
-    parts, violations = study.report(good, options)
+    completed = [row for row in rows if "failed" not in row]
+    parts, violations = study.report(completed, options)
     findings = [f"{row['name']}: {row['failed']}" for row in rows if "failed" in row]
     findings += violations
     parts = [describe_machine(), *parts]
@@ -153,7 +153,7 @@ def run_study(
         if study.columns:
             written.append(f"{stem}.csv")
             write_text(written[-1], format_csv(rows, study.columns))
-        figure = study.draw(good)
+        figure = study.draw(completed)
         if figure is not None:
             from ..figures.plots import save
 
@@ -176,7 +176,7 @@ def describe_machine() -> str:
 
 
 def digest_source(inputs: Iterable[Path] = ()) -> str:
-    """A digest of the source code of the package, the machine, its packages and further files."""
+    """Digest of the package's source code, machine, installed packages and further files."""
     digest = hashlib.sha256(f"{describe_machine()} {digest_package()}".encode())
     for path in inputs:
         digest.update(path.name.encode() + path.read_bytes())
@@ -184,11 +184,11 @@ def digest_source(inputs: Iterable[Path] = ()) -> str:
 
 
 def measure_case(study: Study, case: Case) -> Row:
-    """Run a case in a process of a study, with what that took."""
-    with tempfile.TemporaryFile() as printed:
-        # Libraries print there, too.
+    """Run a case in a worker process, and measure time, memory and output."""
+    with tempfile.TemporaryFile() as output:
+        # Libraries write to these streams directly.
         for stream in (1, 2):
-            os.dup2(printed.fileno(), stream)
+            os.dup2(output.fileno(), stream)
         peak, started, wall_start = find_peak(), time.process_time(), time.monotonic()
         try:
             with warnings.catch_warnings():
@@ -201,8 +201,8 @@ def measure_case(study: Study, case: Case) -> Row:
         seconds, memory = time.process_time() - started, find_peak() - peak
         sys.stdout.flush()
         sys.stderr.flush()
-        printed.seek(0)
-        if text := printed.read().decode(errors="replace").strip():
+        output.seek(0)
+        if text := output.read().decode(errors="replace").strip():
             row["printed"] = text[:500]
     return row | {"seconds": round(seconds, 4), "memory": round(memory, 2)}
 
@@ -212,9 +212,9 @@ def _fail(text: str) -> Row:
 
 
 def find_peak() -> float:
-    """Peak of the memory that this process has had in use [MB]."""
+    """Peak memory of this process [MB]."""
     with suppress(OSError):
-        # Where there is `/proc`, the other figure starts from that of the parent.
+        # The figure of `resource` includes the parent process.
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
     import resource
