@@ -1,16 +1,16 @@
-"""Run time against error, of planners and simulators, with public tools beside them.
+"""Run time against error of planners and simulators, compared with public tools.
 
-Methods run on phases of one freedom, on four sliding contacts. Planners are ours along curves,
-toppra (minimum-time parametrisation, with the internal force eliminated from the limits) and yapss
-(pseudospectral collocation). All simulators but ours are told when directions reverse, from the
-reference, and are restarted there and where the torques step. Plans are replayed open loop from
-rest by the equations of the reference; lost contacts pull by what is measured.
+Methods run on phases with one degree of freedom and four sliding contacts. Planners are ours along
+curves, toppra (minimum-time parametrisation, with the internal force eliminated from the limits)
+and yapss (pseudospectral collocation). All simulators but ours get the times of reversals from the
+reference, and are restarted there and at torque steps. Plans are replayed open loop from rest by
+the equations of the reference; lost contacts have tension, which is measured.
 
-The reference solves the Newton-Euler equations of object and fingers, with contacts that are points
-with normals of rigid bodies (`verification.newton_euler`), together with the contact conditions as
-one linear system. Nothing is shared with the package's own contacts and dynamics; friction keeps
-the directions that it is given. They are integrated by SciPy's DOP853 from step to step of the
-torques, in double precision. Directions reverse where the sliding velocity vanishes.
+The reference solves the Newton-Euler equations of object and fingers, with contact points and
+normals of rigid bodies (`verification.newton_euler`), and the contact conditions as one linear
+system. It shares nothing with the contacts and dynamics of the package; signs of friction are
+prescribed. SciPy's DOP853 integrates between torque breaks in double precision. Signs reverse at
+zeros of the sliding velocity.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ class Instance(NamedTuple):
 
 @lru_cache(maxsize=4)
 def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance, ...]:
-    """First phases of problem files that are curves of four sliding contacts: what peers know.
+    """First phases of problem files that are curves of four sliding contacts, as peers require.
 
-    Those that files share are there once. Without `drag` joints have no viscous friction.
+    Duplicates are removed. Without `drag` joints have no viscous friction.
     """
     instances: dict[object, Instance] = {}
     for path in paths:
@@ -92,32 +92,32 @@ def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance,
         for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
             if phase.formation.rolling:
                 break
-            single = replace(phase, index=0, end=End.REST)
-            alone = replace(problem, start=curve.start, phases=(single,))
-            places = np.round(np.append(curve.start, curve.end), 9) + 0.0
+            single_phase = replace(phase, index=0, end=End.REST)
+            single_problem = replace(problem, start=curve.start, phases=(single_phase,))
+            ends = np.round(np.append(curve.start, curve.end), 9) + 0.0
             limits = (problem.epsilon, *scene.torque_limit, *scene.speed_limit)
-            same = scene.equations, limits, phase.formation.names, tuple(places)
+            key = scene.equations, limits, phase.formation.names, tuple(ends)
             name = f"{Path(path).stem} {phase.number}"
-            instances.setdefault(same, Instance(name, alone, curve))
+            instances.setdefault(key, Instance(name, single_problem, curve))
     return tuple(instances.values())
 
 
 Plan = TorqueProfile | str
-"""The torques that a planner has found for one phase, or why it has not."""
+"""Planned torques of one phase, or the reason of failure."""
 
 
-def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
-    """The motion that the planner guesses first, with a share of its squared speed."""
+def make_slow_motion(instance: Instance, intervals: int, fraction: float = 1.0) -> PathMotion:
+    """Initial guess of the planner, with a fraction of its squared speed."""
     curve = instance.curve
     grid = make_grid(curve, np.zeros(0), intervals + len(curve.segments))
     data = prepare(curve, instance.problem.epsilon, grid, 0)
     profile, _ = guess(data)
-    slow = profile._replace(a=share * profile.a, b=share * profile.b)
+    slow = profile._replace(a=fraction * profile.a, b=fraction * profile.b)
     return PathMotion(curve, data.grid, slow)
 
 
 def find_reversals(motion: PathMotion) -> Array:
-    """Times at which the stretches of a motion begin and the last one ends [s]."""
+    """Boundaries of the stretches of a motion without reversals [s]."""
     last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
     return np.append(0.0, motion.times[last])
 
@@ -125,46 +125,43 @@ def find_reversals(motion: PathMotion) -> Array:
 class Method(NamedTuple):
     """A planner or a simulator."""
 
-    settings: str  # what it is told besides the setting
-    # takes a phase or a course, and a setting; gives what solves it
+    settings: str  # its fixed options
+    # (phase or course, setting) -> solve function
     build: Callable[[Any, str], Callable[[], Any]]
-    choices: dict[str, tuple[str, ...]]  # settings that are measured, by study
-    module: str = ""  # what has to be installed, if anything
+    choices: dict[str, tuple[str, ...]]  # measured settings, by study
+    module: str = ""  # package that has to be installed
 
 
 def run_setting(instance: Instance, study: str, method: str, setting: str) -> Row:
-    """Run one setting of one method on one phase; nothing of a simulator without a course.
+    """Run one setting of one method on one phase; empty for a simulator without a course.
 
-    `build` and `solve` are the times that takes [s], `errors` that of the state at the end, or of
-    the phase time and as of `check_plan`.
+    `build` and `solve` are times [s]; `errors` has the error of the end state of a simulator, or
+    of the phase time and those of `check_plan`.
     """
     subject = instance if study in PLANNING else make_course(instance, study)
     if subject is None:
         return {}
-    own, least = METHODS[method], find_least_time(instance) if study in PLANNING else math.nan
-    if own.module:
-        # No timing is to include the import.
-        __import__(own.module)
+    peer, least = METHODS[method], find_least_time(instance) if study in PLANNING else math.nan
+    if peer.module:
+        # Exclude the import from timings.
+        __import__(peer.module)
     with warnings.catch_warnings():
-        # Warnings of peers are not ours.
+        # Ignore warnings of peers.
         warnings.simplefilter("ignore")
-        built, run = _time(partial(own.build, subject, setting))
-        took, answer = _time(run)
+        build_time, run = _time(partial(peer.build, subject, setting))
+        solve_time, answer = _time(run)
     if isinstance(subject, Course):
         errors = [measure_error(subject.problem, answer, subject.end)]
         outcome = SOLVED if np.isfinite(errors[0]) else "no finite state"
     else:
-        *checked, outcome = check_plan(instance, answer)
-        late = math.nan if isinstance(answer, str) else answer.duration / least - 1
-        errors = [late, *checked]
-    return {"build": built, "solve": took, "errors": errors, "outcome": outcome}
+        *checks, outcome = check_plan(instance, answer)
+        excess = math.nan if isinstance(answer, str) else answer.duration / least - 1
+        errors = [excess, *checks]
+    return {"build": build_time, "solve": solve_time, "errors": errors, "outcome": outcome}
 
 
 def _time(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Mean processor time of as many runs as take 0.2 s, one at least [s], and the last answer.
-
-    Other work on the machine hardly changes it.
-    """
+    """Mean processor time of runs within 0.2 s, at least one [s], and the last answer."""
     answers = deque[Any](maxlen=1)
     timer = Timer(lambda: answers.append(work()), timer=time.process_time)
     count, seconds = timer.autorange()
@@ -181,26 +178,26 @@ def solve_motion(
 ) -> tuple[Array, Array]:
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
-    The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
-    the contact conditions differentiated twice: rates of their rows by complex steps.
+    Newton-Euler equations with Coulomb friction inserted, and second derivatives of the contact
+    conditions; rates of their rows are complex-step derivatives.
     """
     tiny, scene = 1e-30, formation.scene  # [s]
-    ahead = (z + 1j * tiny * z_dot)[None]
-    touches = [locate(scene, name, ahead) for name in formation.names]
-    rows = np.array([touch.normal[0] for touch in touches])
-    slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
+    z_complex = (z + 1j * tiny * z_dot)[None]
+    contacts = [locate(scene, name, z_complex) for name in formation.names]
+    rows = np.array([contact.normal[0] for contact in contacts])
+    sliding = np.array([contact.friction * contact.tangent[0].real for contact in contacts])
     friction = scene.viscous * z_dot + scene.dry * np.append(np.zeros(3), sigma)
     force = scene.applied_force + np.append(np.zeros(3), tau) - friction
     count = len(rows)
     matrix = np.zeros((5 + count, 5 + count))
     matrix[range(5), range(5)] = scene.mass_diagonal
-    matrix[:5, 5:], matrix[5:, :5] = (Xi[:, None] * slide - rows.real).T, rows.real
+    matrix[:5, 5:], matrix[5:, :5] = (Xi[:, None] * sliding - rows.real).T, rows.real
     solution = np.linalg.solve(matrix, np.append(force, -rows.imag @ z_dot / tiny))
     return np.asarray(solution[:5]), np.asarray(solution[5:])
 
 
 class Course(NamedTuple):
-    """One phase with torques, and where it gets to."""
+    """One phase with torques, and its exact end state."""
 
     problem: Problem  # of that phase alone
     torque: TorqueProfile
@@ -218,38 +215,38 @@ def measure_error(problem: Problem, state: Array, exact: Array) -> float:
 def integrate(
     problem: Problem, torque: TorqueProfile, curve: Curve, tolerance: float
 ) -> tuple[Array, list[Array], float]:
-    """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
+    """State at the end of torques, the stretches, and the smallest c_n of all steps.
 
-    A stretch is in one piece of the torques, without a reversal: Xi, sigma, coefficients of its
-    torques column by column, and its ends. Contacts stay closed: those that are lost pull.
+    A stretch lies in one piece of the torques, without reversals: Xi, sigma, coefficients of its
+    torques column by column, and its ends. Contacts stay closed, under tension if necessary.
     """
 
-    def solve(t: float, y: Array, part: Segment, own: TorqueProfile) -> tuple[Array, Array]:
-        tau = own.at(np.array([t]))[0]
+    def solve(t: float, y: Array, part: Segment, piece: TorqueProfile) -> tuple[Array, Array]:
+        tau = piece.at(np.array([t]))[0]
         return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
 
-    def rates(t: float, y: Array, *at: Any) -> Array:
-        return np.concatenate([y[5:], solve(t, y, *at)[0]])
+    def rates(t: float, y: Array, *args: Any) -> Array:
+        return np.concatenate([y[5:], solve(t, y, *args)[0]])
 
     parts, t = [*curve.segments], float(torque.breaks[0])
-    y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
+    y, stretches, min_force = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
     for stop in torque.breaks[1:]:
         while t < stop:
-            part, profile = at = parts[0], torque.cut(t, stop)
+            part, profile = args = parts[0], torque.cut(t, stop)
             events = [_find_reversal(curve.formation, *parts[:2])] if len(parts) > 1 else []
             options: Any = {"events": events, "rtol": tolerance, "atol": tolerance}
-            run = solve_ivp(rates, (t, stop), y, "DOP853", args=at, **options)
-            forces = (solve(*state, *at)[1] for state in zip(run.t, run.y.T, strict=True))
-            least = min(least, *map(np.min, forces))
+            run = solve_ivp(rates, (t, stop), y, "DOP853", args=args, **options)
+            forces = (solve(*state, *args)[1] for state in zip(run.t, run.y.T, strict=True))
+            min_force = min(min_force, *map(np.min, forces))
             start, t, y = t, float(run.t[-1]), run.y[:, -1]
-            own = profile.cut(start, t).coefficients[0].ravel("F")
-            stretches.append(np.concatenate([part.Xi, part.sigma, own, [start, t]]))
+            piece = profile.cut(start, t).coefficients[0].ravel("F")
+            stretches.append(np.concatenate([part.Xi, part.sigma, piece, [start, t]]))
             parts = parts[1:] if run.status == 1 else parts
-    return y, stretches, float(least)
+    return y, stretches, float(min_force)
 
 
 def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:
-    """Event at which the rate vanishes whose direction differs in two segments."""
+    """Event: zero of the rate whose sign differs in two segments."""
     directions = np.append(before.Xi, before.sigma)
     row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
@@ -266,10 +263,10 @@ TOLERANCES = {
 }
 
 
-def build_own(course: Course, setting: str) -> Callable[[], Array]:
+def build_wholearm(course: Course, setting: str) -> Callable[[], Array]:
     """Our simulator, for the state (z, z') at the end of a course, shape (10,).
 
-    What it keeps of a formation is built by a first run.
+    A first run fills its caches of the formation.
     """
 
     def run() -> Array:
@@ -286,12 +283,12 @@ def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
     n_c, terms = formation.n_contacts, course.torque.coefficients.shape[2]
     sizes = {"x": 1, "y": 10, "Xi": n_c, "sigma": 2, "flat": 2 * terms, "ends": 2}
     x, y, Xi, sigma, flat, ends = (ca.SX.sym(name, size) for name, size in sizes.items())
-    # Coefficients come column by column.
+    # Coefficients are stored column by column.
     tau = ca.reshape(flat, 2, -1) @ x ** ca.DM(range(terms))
-    # Accelerations of the contacts are affine in the forces, and have to vanish.
+    # Accelerations of the contacts are affine in the forces, and zero.
     plant, c_n = build_plant(formation), ca.SX.sym("c_n", n_c)
-    of_forces, apart = ca.linear_coeff(plant(y[:5], y[5:], tau, c_n, Xi, sigma)[1], c_n)
-    forces = -ca.solve(of_forces, apart)
+    matrix, constant = ca.linear_coeff(plant(y[:5], y[5:], tau, c_n, Xi, sigma)[1], c_n)
+    forces = -ca.solve(matrix, constant)
     rates = ca.vertcat(y[5:], plant(y[:5], y[5:], tau, forces, Xi, sigma)[0])
     half = (ends[1] - ends[0]) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, ends), "ode": half * rates}
@@ -310,7 +307,7 @@ def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
 
 
 SIMULATORS = {
-    "wholearm": Method("events, contact forces and energies included", build_own, TOLERANCES),
+    "wholearm": Method("events, contact forces and energies included", build_wholearm, TOLERANCES),
     "cvodes": Method(
         "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",
         build_cvodes,
@@ -321,9 +318,9 @@ SIMULATORS = {
 
 @lru_cache(maxsize=64)
 def make_course(instance: Instance, study: str) -> Course | None:
-    """The course of a phase: of 95 % of its last stretch, as just before a stop all is ill-posed.
+    """The course of a phase to 95 % of its last stretch, as the end at rest is ill-posed.
 
-    None if the slow motion would lose a contact.
+    None if the slow motion loses a contact.
     """
     problem, curve = instance.problem, instance.curve
     if study == FEW:
@@ -338,25 +335,25 @@ def make_course(instance: Instance, study: str) -> Course | None:
     breaks = motion.times[np.append(motion.grid.steps > 0, True)]
     breaks = np.append(breaks[breaks < stop], stop)
     torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
-    # The smallest tolerance that SciPy takes.
+    # The smallest tolerance allowed by SciPy.
     end, stretches, _ = integrate(problem, torque, curve, 2.3e-14)
     return Course(problem, torque, stretches, end)
 
 
 def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
-    """Error of the replayed end state, worst violation, and `SOLVED` or why the plan is none.
+    """Error of the replayed end state, worst violation, and `SOLVED` or the reason of failure.
 
-    The violation is of c_n >= epsilon, over the scene's force, or of a torque limit, over it.
+    Violations are those of c_n >= epsilon, over the scene's force, and of relative torque limits.
     """
     if isinstance(plan, str):
         return math.nan, math.nan, plan
     problem, curve = instance.problem, instance.curve
-    state, _, least = integrate(problem, plan, curve, 1e-10)
+    state, _, min_force = integrate(problem, plan, curve, 1e-10)
     end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
     excess = float((plan.peaks / problem.scene.torque_limit).max()) - 1
-    violation = max(0.0, excess, (problem.epsilon - least) / problem.scene.scales.force)
+    violation = max(0.0, excess, (problem.epsilon - min_force) / problem.scene.scales.force)
     tests = (
-        (least > 0, "a contact is lost between nodes"),
+        (min_force > 0, "a contact is lost between nodes"),
         (end <= 1e-2, "the replay ends elsewhere"),
         (excess <= 1e-2, "a torque limit is missed between nodes"),
     )
@@ -374,20 +371,20 @@ def build_plant(formation: Formation) -> Expression:
     applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
     G = build_force_rows(formation, P, A_t, Xi)
     acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
-    missed = P @ acceleration + P_dot_v
-    return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
+    residual = P @ acceleration + P_dot_v
+    return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, residual])
 
 
 @lru_cache(maxsize=64)
 def find_least_time(instance: Instance) -> float:
-    """Lower bound of the least time by a sweep over speeds, which shares nothing with NLPs [s]."""
+    """Lower bound of the least time by a speed sweep, independent of NLPs [s]."""
     bound = bound_least_time((instance.curve,), instance.problem.epsilon)
     assert bound is not None, "phases of four sliding contacts have one"
     return bound.value
 
 
 def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
-    """Ours along the curve; its NLP is built anew."""
+    """Our planner along the curve, with a new NLP."""
     curve, epsilon = instance.curve, instance.problem.epsilon
     options = PlanOptions(accuracy=float(setting))
     build_path_nlp.cache_clear()
@@ -397,7 +394,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
 
 
 def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
-    """Limits at places of a curve, whose segments are `owner`."""
+    """Limits at places s of a curve in segments `owner`."""
     curve, point = instance.curve, instance.curve.evaluate(s)
     forces = inverse(curve.formation, point, directions_of(curve, owner))
     limits = make_limits(curve.formation, instance.problem.epsilon)
@@ -405,24 +402,24 @@ def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
 
 
 def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
-    """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
+    """Toppra with limits at both ends of the intervals of a grid refined towards the ends."""
     import toppra
     from toppra.constraint import DiscretizationType, LinearConstraint
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     toppra.setup_logging("ERROR")
     length = instance.curve.length
-    apart = 1e-7 * length  # of grid points from a reversal between them
+    offset = 1e-7 * length  # of grid points from a reversal
     grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
     stops = [part.stop for part in instance.curve.segments[:-1]]
     for stop in stops:
-        far = grid[np.abs(grid - stop) > 4 * apart]
-        grid = np.sort([*far, stop - apart, stop + apart])
+        distant = grid[np.abs(grid - stop) > 4 * offset]
+        grid = np.sort([*distant, stop - offset, stop + offset])
     rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
     constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
-    # The parameters of the limits, with the internal force eliminated, are those of the grid.
+    # The internal force is eliminated; parameters are evaluated on the grid only.
     limits, columns = LinearConstraint(), (a, b, constant, below, zero, None, None, grid)
     limits.identical = True
     limits.set_discretization_type(DiscretizationType.Interpolation)
@@ -444,7 +441,7 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
 def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
     """Torques by inverse dynamics, with the internal force linear between grid points.
 
-    The two points beside a reversal become one, with a step of the torques.
+    The two points at a reversal are merged, with a step of the torques.
     """
     stops = np.array([part.stop for part in instance.curve.segments[:-1]])
     later = np.searchsorted(grid, stops)
@@ -468,9 +465,9 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
 
 
 def build_yapss(instance: Instance, setting: str) -> Callable[[], Plan]:
-    """A phase for every stretch, with contact forces among the controls, on Legendre-Gauss points.
+    """Yapss with a phase for every stretch, and contact forces as controls.
 
-    The slow motion is the first guess.
+    Legendre-Gauss points; the initial guess is the slow motion.
     """
     import yapss
 
@@ -496,7 +493,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], Plan]:
         last = bounds.final_state
         last.lower[progress] = last.upper[progress] = ends[index + 1, progress]
         guess.time = np.linspace(start, stop, 2 * count + 1)
-        # The ends of a stretch are evaluated within it.
+        # The ends of a stretch are evaluated inside it.
         inset = 1e-9 * (stop - start)
         samples = slow.evaluate(np.clip(guess.time, start + inset, stop - inset))
         guess.state = np.hstack([samples.z, samples.z_dot]).T
@@ -531,9 +528,9 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
             symbols = [*phase.state, *phase.control]
             x = ca.vertcat(*((x if hasattr(x, "_value") else x.item())._value for x in symbols))
             parts = ca.vertsplit(x, [0, 5, 10, 12, len(symbols)])
-            acceleration, missed = map(ca.vertsplit, plant(*parts, part.Xi, part.sigma))
+            acceleration, residual = map(ca.vertsplit, plant(*parts, part.Xi, part.sigma))
             phase.dynamics[:] = (*phase.state[5:], *map(SXW, acceleration))
-            phase.path[:] = tuple(map(SXW, missed))
+            phase.path[:] = tuple(map(SXW, residual))
 
     def discrete(arg: Any) -> None:
         links = list[Any]()
@@ -548,7 +545,7 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
 
 
 def _read(solution: Any) -> Plan:
-    """The torques linear between collocation points: their polynomials swing wide in between."""
+    """Torques, linear between collocation points: collocation polynomials oscillate."""
     if solution.nlp_info.ipopt_status != 0:
         return str(solution.nlp_info.ipopt_status_message)
     rows = []
@@ -608,39 +605,39 @@ TARGETS = dict.fromkeys(SIMULATION, (1e-6, 1e-9, 1e-11)) | dict.fromkeys(
 
 
 def _find_times(rows: Sequence[Row], target: float, count: int | None) -> dict[str, float]:
-    """Least times in which a method reaches an error on each phase [s]; infinite without any.
+    """Least times in which a method reaches an error on each phase [s]; else infinity.
 
-    With planners the time to build counts; `count` of their errors have to be small, or all.
+    Planners include the build time; the first `count` errors have to be small, or all.
     """
     times: dict[str, float] = {}
     for row in rows:
         error = max(map(abs, row["errors"][:count]))
-        took = row["solve"] + (row["build"] if row["study"] in PLANNING else 0.0)
-        reached = took if row["outcome"] == SOLVED and error <= target else math.inf
-        times[row["phase"]] = min(times.get(row["phase"], math.inf), reached)
+        seconds = row["solve"] + (row["build"] if row["study"] in PLANNING else 0.0)
+        result = seconds if row["outcome"] == SOLVED and error <= target else math.inf
+        times[row["phase"]] = min(times.get(row["phase"], math.inf), result)
     return times
 
 
 def _format_targets(
     rows: Sequence[Row], study: str, title: str, count: int | None, limit: float
 ) -> list[str | Table]:
-    """Times to reach errors, and how many times as long as ours that is."""
+    """Times to reach errors, and their ratios to our times."""
     groups, table = group(rows, "method"), []
-    own = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
-    if own is None:
+    reference = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
+    if reference is None:
         return []
     for method, mine in groups.items():
         cells: list[Any] = [method]
         for target in TARGETS[study]:
-            times, ours = (_find_times(part, target, count) for part in (mine, own))
+            times, ours = (_find_times(part, target, count) for part in (mine, reference))
             names = times.keys() & ours.keys()
             reached = sum(math.isfinite(times[name]) for name in names)
             mean, least = (
                 find_mean([min(part[name], limit) for name in names] or [math.nan])
                 for part in (times, ours)
             )
-            shown = (mean, mean / least) if reached else (None, None)
-            cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
+            entries = (mean, mean / least) if reached else (None, None)
+            cells += [entries[0], f"{reached} of {len(names)}", entries[1]]
         table.append(cells)
     heads = [(f"{t:g} [s]:.4f", "reached", "times ours:.2g") for t in TARGETS[study]]
     title = f"## {study[0].upper()}{study[1:]}{title}"
@@ -648,11 +645,11 @@ def _format_targets(
 
 
 def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
-    """One panel; hollow markers are settings with which some phases are not solved."""
+    """One panel; hollow markers are settings with unsolved phases."""
     planning = study in PLANNING
-    for index, (method, mine) in enumerate(group(rows, "method").items()):
+    for index, (method, method_rows) in enumerate(group(rows, "method").items()):
         points, hollow = list[tuple[float, float]](), list[tuple[float, float]]()
-        for phases in group(mine, "setting").values():
+        for phases in group(method_rows, "setting").values():
             finite_rows = [row for row in phases if np.isfinite(row["errors"][0])]
             if 2 * len(finite_rows) < len(phases):
                 continue
@@ -660,13 +657,13 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
             seconds = find_mean([row["solve"] + planning * row["build"] for row in finite_rows])
             points.append((max(error, 1e-16), seconds))
             hollow += points[-1:] * any(row["outcome"] != SOLVED for row in phases)
-        look: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
-        axes.loglog(*np.reshape(points, (-1, 2)).T, label=method, **look)
-        look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
-        axes.loglog(*np.reshape(hollow, (-1, 2)).T, **look)
+        style: Any = {"color": PALETTE[index], "marker": MARKERS[index], "markersize": 5}
+        axes.loglog(*np.reshape(points, (-1, 2)).T, label=method, **style)
+        style |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
+        axes.loglog(*np.reshape(hollow, (-1, 2)).T, **style)
     axes.set_title(f"{study[0].upper()}{study[1:]}")
-    what = "relative error of the phase time" if planning else "error of z and z' in scene units"
-    axes.set_xlabel(f"{what}, median over phases [-]")
+    label = "relative error of the phase time" if planning else "error of z and z' in scene units"
+    axes.set_xlabel(f"{label}, median over phases [-]")
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
     axes.grid(True, which="major", color=GRID, linewidth=0.6)
     if axes.lines:
@@ -680,15 +677,15 @@ class Precision(Study):
     keys = ("study", "phase", "method", "setting")
     columns = (*keys, "build", "solve", "errors", "outcome")
     needs_problems = True
-    allowed = 60.0
+    time_limit = 60.0
     options = """\
 --peers NAME ...  measure these methods only, by the names that the table has (all)
 --limit S         processor time that one setting may take on one phase [s] = 60.0 in 1e-3..1e6
 """
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """Study, phase, method, setting, and the files that phases are from."""
-        self.allowed = options.limit
+        """Study, phase, method, setting, and problem files."""
+        self.time_limit = options.limit
         files = tuple(map(str, sorted(Path(options.problems).glob("*.toml"))))
         if not files:
             text = f"{options.problems} has no problem files (*.toml)"
@@ -698,15 +695,15 @@ class Precision(Study):
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
         for study, (method, peer) in product(SIMULATION + PLANNING, METHODS.items()):
-            asked = method in (options.peers or METHODS)
+            selected = method in (options.peers or METHODS)
             is_installed = not peer.module or find_spec(peer.module)
-            if asked and study in peer.choices and is_installed:
+            if selected and study in peer.choices and is_installed:
                 phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
                 yield from product([study], phases, [method], peer.choices[study], [files])
 
     def limit(self, case: Case) -> float:
-        """The time allowed, and that of the reference."""
-        return self.allowed + 120.0
+        """The time limit, and that of the reference."""
+        return self.time_limit + 120.0
 
     def run(self, case: Case) -> Row:
         """Measure one setting."""
@@ -722,13 +719,13 @@ class Precision(Study):
         counts = {", by the error of the phase time": 1, ", by all three errors": None}
         for study in SIMULATION + PLANNING:
             for title, count in counts.items() if study in PLANNING else [("", None)]:
-                mine = measured.get(study, [])
-                parts += _format_targets(mine, study, title, count, options.limit)
+                study_rows = measured.get(study, [])
+                parts += _format_targets(study_rows, study, title, count, options.limit)
         table = [(name, method.settings) for name, method in METHODS.items()]
         return [*parts, "## Settings", Table(["method", "settings"], table)], []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
-        """Mean run time over the error that half of the phases keep, one line for each method."""
+        """Mean run time over the median error, one line for each method."""
         measured = group((row for row in rows if "errors" in row), "study")
         with open_figure(11.0, 9.0, layout="constrained") as figure:
             for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):

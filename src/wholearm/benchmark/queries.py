@@ -1,9 +1,9 @@
-"""Seeded queries from pose to pose: which are solved, how fast, and how near to the bound.
+"""Seeded queries from pose to pose: number solved, processor time, and gap to the bound.
 
-A query has a start and a goal, each an edge on the palm and an x at which both fingers close on the
-object, drawn at random for the shipped scenes and for random polygons in the hexagon's hand. Each
-query is asked twice: first of a scene that nothing is known of, then for a goal a little further
-on, with what is known. `draw_leg` draws routes that need no search.
+Start and goal of a query are random: an edge on the palm and an x at which both fingers close on
+the object, for the shipped scenes and for random polygons in the hexagon's hand. Each scene is
+searched twice: first without a roadmap, then with it for a goal slightly farther on. `draw_leg`
+draws routes that need no search.
 
 With ``--ways`` the phases that `route` prints take the place of the goal (see README.md).
 """
@@ -37,13 +37,13 @@ from ..verification.verify import verify
 from .study import Case, Findings, Row, Study, group
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
-SAME = 1e-4  # relative difference of values of plans that count as the same
+SAME = 1e-4  # largest relative difference of equal values of plans
 RATE = 250.0  # limit of torque rates over that of torques [1/s]
 WAYS = ("printed", "time", "rates", "period", "dwell", "policy")
 
 
 class Queries(Study):
-    """Queries, second ones on the same map, and routes carried out."""
+    """Queries, second queries on the same map, and execution of routes."""
 
     name, title = "queries", "From pose to pose"
     needs_problems = seeded = True
@@ -55,21 +55,21 @@ class Queries(Study):
 """
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """What is drawn, its seed and number, folder of the problems, objective, and ways."""
+        """Kind of problem, seed, number, folder of the problems, objective, and ways."""
         objective = PlanOptions(objective=options.objective).goal.value
         ways = tuple(choice(*WAYS).read(way, "--ways") for way in options.ways)
-        asked = options.problems, objective, ways
+        settings = options.problems, objective, ways
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
-            yield from ((kind, options.seed, k, *asked) for k in range(count))
+            yield from ((kind, options.seed, k, *settings) for k in range(count))
 
     def limit(self, case: Case) -> float:
         """Two searches, and the plans."""
         return 1800.0 if case[-1] else 600.0
 
     def run(self, case: Case) -> Row:
-        """Ask a query, and a second one."""
-        drawn, seed, number, folder, objective, ways = case
-        problem = DRAW[drawn](seed, number, Path(folder))
+        """Solve a query, and a second one on the same map."""
+        source, seed, number, folder, objective, ways = case
+        problem = DRAW[source](seed, number, Path(folder))
         forget_roadmaps()
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
@@ -85,21 +85,21 @@ class Queries(Study):
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
         goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
-        further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
+        next_goal = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
         with suppress(WholearmError):
-            find_route(problem.with_({"goal": further}), objective)
+            find_route(problem.with_({"goal": next_goal}), objective)
             row["second"] = time.process_time() - started
         return row | {"kind": "solved"} | (_carry_out(problem, answer, ways) if ways else {})
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> Findings:
-        """What came of them, and the times."""
+        """Outcomes and times."""
         groups, lines = {"all": rows, **group(rows, "kind")}, list[str]()
-        times = {name: [row["first"] for row in mine] for name, mine in groups.items()}
+        times = {name: [row["first"] for row in members] for name, members in groups.items()}
         times["second query"] = [row["second"] for row in rows if "second" in row]
         table = [
-            (name, len(took), *np.percentile(took, [50, 95, 100]))
-            for name, took in times.items()
-            if took
+            (name, len(elapsed), *np.percentile(elapsed, [50, 95, 100]))
+            for name, elapsed in times.items()
+            if elapsed
         ]
         heads = ["queries", "number:d", "processor time, median [s]:.2f", "95 %:.2f", "most:.2f"]
         ratios = [row["second"] / row["first"] for row in rows if "second" in row]
@@ -109,8 +109,8 @@ class Queries(Study):
         if gaps:
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
             lines.append(f"{text}, median {100 * np.median(gaps):.2g} %.")
-        solved = [row["ways"] for row in rows if "ways" in row]
-        carried = [*filter(None, (_sum_up(way, solved) for way in WAYS))]
+        results = [row["ways"] for row in rows if "ways" in row]
+        way_rows = [*filter(None, (_sum_up(way, results) for way in WAYS))]
         heads_of_ways = ["", "carried out", "objective off, median:.2g", "most:.2g"]
         heads_of_ways += ["time, median:.2f", "95 %:.2f"]
         refusals = [
@@ -119,9 +119,9 @@ class Queries(Study):
             for way, part in row.get("ways", {}).items()
             if part.get("why")
         ]
-        told = ["Refused:", "\n".join(refusals)] if refusals else []
+        listing = ["Refused:", "\n".join(refusals)] if refusals else []
         parts: list[str | Table] = [Table(heads, table), "\n".join(lines)]
-        parts += [Table(heads_of_ways, carried), *told]
+        parts += [Table(heads_of_ways, way_rows), *listing]
         return parts, [f"{row['text']}: {row['findings'][0]}" for row in rows if "findings" in row]
 
 
@@ -129,7 +129,7 @@ STUDY = Queries()
 
 
 def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
-    """The phases that a route prints, planned and carried out in the ways that are asked for."""
+    """Printed phases of a route, planned and executed in the selected ways."""
     row: Row = {"ways": {}}
     table = {key: entry for key, entry in problem.table.items() if key != "goal"}
     objective, printed = answer.plan.options.goal.value, None
@@ -189,7 +189,7 @@ def draw_query(seed: int, number: int, folder: Path) -> Problem:
 
 
 def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
-    """The problem of a query about a polygon of its own, of 3 to 8 corners, in a shipped hand."""
+    """Query with a new polygon of 3 to 8 corners in a shipped hand."""
     rng = np.random.default_rng([seed, number, 2])
     base = read_problem(str(folder / f"{('heptagon', 'hexagon', 'triangle')[number % 3]}.toml"))
     table = {key: entry for key, entry in base.table.items() if key != "phases"}
@@ -233,9 +233,9 @@ def _draw_pose(rng: np.random.Generator, table: dict[str, Any]) -> dict[str, flo
 def draw_leg(
     seed: int, number: int, folder: Path
 ) -> tuple[Problem, list[tuple[float, float]]] | None:
-    """Draw a leg of a shipped scene: a slide, and one to three cells; and where its phases stop.
+    """Draw a leg of a shipped scene, a slide and one to three cells, and ends of its phases.
 
-    Stops are (x, phi) [m, rad]. None if no route of 200 can be listed.
+    Ends are (x, phi) [m, rad]. None if none of 200 routes can be listed.
     """
     rng = np.random.default_rng([seed, number])
     base = read_problem(str(folder / f"{SHIPPED[number % len(SHIPPED)]}.toml"))
@@ -252,7 +252,7 @@ def draw_leg(
             problem = build_problem({**base.table, "phases": phases})
         except InputError:
             continue
-        # Ends are the planner's to choose: what a refusal says holds for all places.
+        # The planner chooses ends freely, so a refusal holds for all of them.
         open_ends = (replace(each, until=replace(each.until, pins=())) for each in problem.phases)
         problem = replace(problem, phases=tuple(open_ends))
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
