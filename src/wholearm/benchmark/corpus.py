@@ -370,17 +370,17 @@ def _report(folder: Path, name: str) -> Row:
 
 
 def _draw_map(folder: Path, name: str) -> Row:
-    chart = wholearm.build_map(_load(folder, name))
-    x, phi = np.sort([crossing.point for crossing in chart.crossings], axis=0).T.tolist()
+    graph = wholearm.build_map(_load(folder, name))
+    x, phi = np.sort([crossing.point for crossing in graph.crossings], axis=0).T.tolist()
     return {
-        "formations": _count(chart.formations),
-        "borders": _count(border.contacts for border in chart.borders),
-        "crossings": _count(crossing.contacts for crossing in chart.crossings),
+        "formations": _count(graph.formations),
+        "borders": _count(border.contacts for border in graph.borders),
+        "crossings": _count(crossing.contacts for crossing in graph.crossings),
         "x": x,
         "phi": phi,
-        "forth": sum(int(border.forth.sum()) for border in chart.borders),
-        "back": sum(int(border.back.sum()) for border in chart.borders),
-        "possible": chart.possible.sum(axis=0).tolist(),
+        "forth": sum(int(border.forth.sum()) for border in graph.borders),
+        "back": sum(int(border.back.sum()) for border in graph.borders),
+        "possible": graph.possible.sum(axis=0).tolist(),
     }
 
 

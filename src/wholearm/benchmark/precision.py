@@ -626,17 +626,19 @@ def _format_targets(
     reference = groups.get("wholearm, curve" if study in PLANNING else "wholearm")
     if reference is None:
         return []
-    for method, mine in groups.items():
+    for method, method_rows in groups.items():
         cells: list[Any] = [method]
         for target in TARGETS[study]:
-            times, ours = (_find_times(part, target, count) for part in (mine, reference))
-            names = times.keys() & ours.keys()
-            reached = sum(math.isfinite(times[name]) for name in names)
-            mean, least = (
-                find_mean([min(part[name], limit) for name in names] or [math.nan])
-                for part in (times, ours)
+            times, base_times = (
+                _find_times(part, target, count) for part in (method_rows, reference)
             )
-            entries = (mean, mean / least) if reached else (None, None)
+            names = times.keys() & base_times.keys()
+            reached = sum(math.isfinite(times[name]) for name in names)
+            mean, reference_mean = (
+                find_mean([min(part[name], limit) for name in names] or [math.nan])
+                for part in (times, base_times)
+            )
+            entries = (mean, mean / reference_mean) if reached else (None, None)
             cells += [entries[0], f"{reached} of {len(names)}", entries[1]]
         table.append(cells)
     heads = [(f"{t:g} [s]:.4f", "reached", "times ours:.2g") for t in TARGETS[study]]

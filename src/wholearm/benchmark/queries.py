@@ -160,19 +160,19 @@ def _carry_out(problem: Problem, answer: Answer, ways: tuple[str, ...]) -> Row:
         row["ways"][way] = part | {"seconds": time.process_time() - started}
         if printed is None:
             return row | {"findings": [f"as printed: {part['why']}"]}
-    if abs(off := row["ways"]["printed"]["off"]) > SAME:
-        row["findings"] = [f"as printed: off by {off:.2g}"]
+    if abs(deviation := row["ways"]["printed"]["off"]) > SAME:
+        row["findings"] = [f"as printed: off by {deviation:.2g}"]
     return row
 
 
 def _sum_up(way: str, solved: Sequence[Row]) -> list[Any] | None:
-    """How many routes are carried out in a way, how far off, and in which time."""
-    parts = [ways for ways in solved if way in ways]
-    good = [ways for ways in parts if not ways[way].get("why")]
-    off = [ways[way]["off"] for ways in good if "off" in ways[way]] or [math.nan]
-    ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in good] or [math.nan]
-    cells = np.median(off), max(off, key=abs), *np.percentile(ratios, [50, 95])
-    return [way, f"{len(good)} of {len(parts)}", *cells] if parts else None
+    """Row of a way: number of routes, deviations of the objective, relative times."""
+    attempts = [ways for ways in solved if way in ways]
+    completed = [ways for ways in attempts if not ways[way].get("why")]
+    deviations = [ways[way]["off"] for ways in completed if "off" in ways[way]] or [math.nan]
+    ratios = [ways[way]["seconds"] / ways["printed"]["seconds"] for ways in completed] or [math.nan]
+    cells = np.median(deviations), max(deviations, key=abs), *np.percentile(ratios, [50, 95])
+    return [way, f"{len(completed)} of {len(attempts)}", *cells] if attempts else None
 
 
 def draw_query(seed: int, number: int, folder: Path) -> Problem:

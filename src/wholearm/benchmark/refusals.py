@@ -466,8 +466,8 @@ def list_ends(phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     scale, far = np.sqrt(metric_weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
     tangent = np.linalg.svd(_find_misses(phase, first, end=True)[1] / scale)[2][-1] / scale
     steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
-    others = [project(phase, first + step * tangent, end=True) for step in steps]
-    points = np.array([first, *(end for end in others if end is not None)])
+    neighbours = [project(phase, first + step * tangent, end=True) for step in steps]
+    points = np.array([first, *(end for end in neighbours if end is not None)])
     return points[find_valid(formation, points)]
 
 

@@ -227,8 +227,8 @@ def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
 def _describe_scenes(rows: Sequence[Row]) -> list[Table]:
     verdicts = [row["verdict"] or "not judged" for row in rows if row["outcome"] == "refused"]
     seconds = np.array([row["seconds"] for row in rows])
-    middle, most = np.percentile(seconds, [50, 95])
-    text = f"median {middle:.2f} s, 95 % within {most:.2f} s, longest {seconds.max():.2f} s"
+    middle, high = np.percentile(seconds, [50, 95])
+    text = f"median {middle:.2f} s, 95 % within {high:.2f} s, longest {seconds.max():.2f} s"
     summary = [
         ("scenes", str(len({row["case"][2] for row in rows}))),
         ("answers, one for each objective", _count(row["outcome"] for row in rows)),

@@ -390,9 +390,9 @@ class Rest(Statics):
         normals, bounds = self.holding_polygon
         loss = x
         if np.isfinite(bounds).all():
-            margins_held = -normals @ coefficients
-            margins_held[:, 0] += bounds
-            loss = find_breach(margins_held, x)
+            slacks = -normals @ coefficients
+            slacks[:, 0] += bounds
+            loss = find_breach(slacks, x)
         start_modes = list(self.list_modes())
         margins = [mode.margins for mode in start_modes]
         rows = np.vstack(margins)

@@ -325,8 +325,8 @@ class Replay(Run):
         """End the phase: continue in motion, stop, or compute a plastic impact.
 
         After a stop the formation holds until the next torque step, or their end, within the
-        `window` [s] or the planned remaining time; only the window counts right `after_step`. The
-        default window is zero in motion.
+        `window` [s] or the planned remaining time; only the window counts `after_step`. The default
+        window is `settling` at low speed, else zero.
         """
         if window is None:
             window = self.settling if abs(self._measure_rate()) < REST_SPEED else 0.0

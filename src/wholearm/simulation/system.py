@@ -72,7 +72,7 @@ class Structure:
     geometry: Expression  # (g,): parameters of gaps and slip coordinates
     pairs: tuple[ContactPair, ...]
     driven: tuple[int, ...]  # coordinates of the two motors; empty without motors
-    turns: tuple[bool, ...]  # which coordinates are angles
+    angular: tuple[bool, ...]  # whether each coordinate is an angle
 
     def build_rows(self, indices: Sequence[int], v: Expression) -> tuple[Expression, ...]:
         """Gaps, slips, A, A_t, A' v and A_t' v of some pairs, as expressions of z and v."""
@@ -96,7 +96,7 @@ class Structure:
 @lru_cache(maxsize=256)
 def _build_rows(structure: Structure, indices: tuple[int, ...]) -> Batch:
     """A, A_t, A' v, A_t' v and slips of some pairs as columns, of z, v and the geometry."""
-    v = ca.SX.sym("v", len(structure.turns))
+    v = ca.SX.sym("v", len(structure.angular))
     _, slip, *rows = structure.build_rows(indices, v)
     columns = ca.densify(ca.horzcat(*rows, slip))
     return Batch(ca.Function("rows", [structure.z, v, structure.geometry], [columns.T]))
@@ -129,7 +129,7 @@ class System:
     @cached_property
     def units(self) -> Array:
         """Units of z, then of z', shape (2 n,)."""
-        place = np.where(self.structure.turns, 1.0, self.scales.length)
+        place = np.where(self.structure.angular, 1.0, self.scales.length)
         return np.concatenate([place, place / self.scales.time])
 
     def is_slower(self, v: Array, bound: float) -> bool:
@@ -201,8 +201,8 @@ def _build(count: int, rounded: tuple[bool, ...], collide: bool) -> Structure:
         pairs.append(pair)
     if collide:
         pairs += _list_link_pairs(bodies.links, any(rounded))
-    turns = (False, False, True, True, True)
-    return Structure(bodies.z, geometry, tuple(pairs), (3, 4), turns)
+    angular = (False, False, True, True, True)
+    return Structure(bodies.z, geometry, tuple(pairs), (3, 4), angular)
 
 
 def _list_link_pairs(links: Sequence[Link], rounded: bool) -> list[ContactPair]:
@@ -360,7 +360,7 @@ class ModeStepper:
             getattr(inputs, name)[:] = getattr(system, name)
         inputs.tolerance[:], inputs.inverse_mass[:] = tolerance, 1 / system.mass
         inputs.mu[:], scales = system.friction[list(self.modes.kept)], system.scales
-        inputs.friction_units[:] = np.where(system.structure.turns, scales.torque, scales.force)
+        inputs.friction_units[:] = np.where(system.structure.angular, scales.torque, scales.force)
         inputs.scales[:] = scales.force, scales.speed
         anchors = np.append(system.evaluate(z, z, self.modes.kept).slip, z)
         inputs.anchors[:] = anchors[[rows[0] for rows in self.modes.holders]]
@@ -369,7 +369,7 @@ class ModeStepper:
 @lru_cache(maxsize=256)
 def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeStepper:
     """Steps of a set of modes without its signs, for torques of a polynomial degree."""
-    n, k, s = len(structure.turns), len(modes.kept), len(modes.holders)
+    n, k, s = len(structure.angular), len(modes.kept), len(modes.holders)
     numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
     sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
     bounds = np.cumsum([0, *sizes]).tolist()
@@ -412,7 +412,7 @@ def _build_motion(
     and margins; and the outputs from the acceleration to the event values. Returns a function that
     projects (z, z') onto the constraints, in the metric M.
     """
-    n, k, z = len(structure.turns), len(modes.kept), structure.z
+    n, k, z = len(structure.angular), len(modes.kept), structure.z
     v, time, mu, inverse_mass = ca.SX.sym("v", n), ca.SX.sym("time"), x.mu, x.inverse_mass
     gap, slip, A, A_t, bend, bend_t = structure.build_rows(modes.kept, v)
     first_rows = [rows[0] for rows in modes.holders]
