@@ -484,7 +484,7 @@ SATURATION = 0.1  # saturation of margins, over the scene's units
 # Largest delay of a start after the loss of balance, in half pieces of torques, as accelerations
 # have to exceed rounding. Case: phase 1 of query 50 with limited rates.
 START_DELAY = 1e-6
-MIN_DRIVE = 0.02  # smallest closing acceleration, over the scene's
+DRIVE = 0.02  # smallest closing acceleration, over the scene's
 _SMALL = 1e-9  # relative opening rate that counts as zero
 
 
@@ -528,7 +528,7 @@ def find_hold(stop: Standstill, epsilon: float, gap: float) -> Hold | None:
     """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
     A gained contact, open by up to `gap` [m], is closed with an acceleration of at least
-    `MIN_DRIVE` if torques for it exist.
+    `DRIVE` if torques for it exist.
     """
     holding_rows = _build_holding_rows(stop, epsilon)
     best = maximise_margin(stop.formation.scene.torque_limit, holding_rows)
@@ -587,10 +587,10 @@ def _find_closing(stop: Standstill, holding_rows: Array, opening: Array, gap: fl
     for mode in _list_sliding(stop.formation, z):
         rows, closing = holding_rows, -normal @ mode.response.acceleration
         if mode.heading is None:
-            rows = np.vstack([holding_rows, mode.slips[mode.response.mode.signs != 0] / MIN_DRIVE])
+            rows = np.vstack([holding_rows, mode.slips[mode.response.mode.signs != 0] / DRIVE])
         elif normal @ mode.heading >= 0:
             continue
-        closing_bound = closing - [MIN_DRIVE * scales.acceleration, 0.0, 0.0]
+        closing_bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
         solution = maximise_margin(scene.torque_limit, rows, closing_bound[None])
         if solution is None or solution[1] < max(MIN_MARGIN, best.margin if best else 0.0):
             continue
