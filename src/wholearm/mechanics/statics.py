@@ -124,12 +124,13 @@ class Statics:
         bounds = scales.torque * bounds[sides] / lengths[sides]
         return TorquePolygon(normals, bounds + np.abs(normals) @ self.scene.dry[3:])
 
-    def find_pulls(self, tau: Array) -> Array:
-        """Pulls p >= 0 of the contacts, (n_c,) [N], of least sum with which forces balance.
+    def find_pulls(self, tau: Array, count: int) -> Array:
+        """Pulls p >= 0 of the first `count` contacts, (n_c,) [N], of least sum that balance.
 
         Contact forces are those of cones less p along the normals. Infinite if no pulls balance.
         """
         free = np.tile([0.0, np.inf], (len(self.A), 1))
+        free[count:] = 0.0
         answer = self._solve(tau, -self.A.T, free, np.ones(len(self.A)))
         return np.full(len(self.A), np.inf) if answer is None else answer.x
 

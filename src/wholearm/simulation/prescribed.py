@@ -250,6 +250,10 @@ class Replay(Run):
         text = self.note(EventKind.CONTACT_LOST, f"c_n of {contact} falls {how}", contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
+    def reach_limit(self, text: str) -> Outcome:
+        """End at a limit of the formation."""
+        return Outcome(OutcomeKind.LIMIT_REACHED, self.note(EventKind.LIMIT, text))
+
     def release(self, c_n: float) -> Stop:
         """End the phase as the next one lets contacts go; the least that they would need [N]."""
         names = ", ".join(self.releasable)
@@ -410,6 +414,8 @@ class Replay(Run):
             return self.fail_by_slip(row, change.c_n, change.c_t)
         if change.contact in self.releasable:
             return self.release(change.c_n)
+        if change.closing:
+            return self.reach_limit(change.closing)
         return self.lose(change.contact, change.c_n)
 
     def move(self) -> Ending:
@@ -530,8 +536,7 @@ class Replay(Run):
             return self.slip()
         reached = [] if bounds else [k for k in kinds if limit.start <= k < limit.stop]
         if reached:
-            text = self.note(EventKind.LIMIT, self.ends.texts[reached[0] - limit.start])
-            return Outcome(OutcomeKind.LIMIT_REACHED, text)
+            return self.reach_limit(self.ends.texts[reached[0] - limit.start])
         turning, free = self._find_turning(kinds), self.formation.n_constraints < 4
         if turning and not free and self.phase.end is End.SMOOTH and self.is_there():
             # Phase 1 of scene 584 of seed 1128 turns 5 nm before its end, for the least time.
