@@ -467,6 +467,10 @@ def test_a_corner_that_strikes_off_its_centroid(restitution: float) -> None:
     run = simulate_body(body, [0, 0.1, 0], [0.2, -1.0, 0.0], 1e-3, restitution)
     p = (1 + restitution) / (1 + 0.1**2 / 0.01)
     assert run.records[0].y[3:6] == pytest.approx([0.2, -1 + p, -0.1 * p / 0.01], abs=CLOSE)
+    # Torques are held from where they step: the polynomial ends with a piece of 1 ns.
+    pieces = np.repeat([[[1.0, 0.1, 0.1]], [[5.0, 0.0, 0.0]]], 2, axis=1)
+    run = FreeRun(body, TorqueProfile(np.array([0.0, 1e-9, 1.0]), pieces), run.z, run.v)
+    assert run.tau(1e-6) == pytest.approx([1.2, 1.2])
 
 
 @pytest.mark.parametrize(("enters", "lands"), [(0.006, True), (0.018, False)])

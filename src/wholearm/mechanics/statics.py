@@ -124,12 +124,13 @@ class Statics:
         bounds = scales.torque * bounds[sides] / lengths[sides]
         return TorquePolygon(normals, bounds + np.abs(normals) @ self.scene.dry[3:])
 
-    def find_pulls(self, tau: Array) -> Array:
-        """Tensions p >= 0 of the contacts, (n_c,) [N], of least sum in static balance.
+    def find_pulls(self, tau: Array, count: int) -> Array:
+        """Tensions p >= 0 of the first `count` contacts, (n_c,) [N], of least sum in balance.
 
         They add to forces in the friction cones. Infinite if there is no balance.
         """
         bounds = np.tile([0.0, np.inf], (len(self.A), 1))
+        bounds[count:] = 0.0
         solution = self._solve(tau, -self.A.T, bounds, np.ones(len(self.A)))
         return np.full(len(self.A), np.inf) if solution is None else solution.x
 

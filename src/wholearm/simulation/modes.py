@@ -237,6 +237,7 @@ class Collapse(NamedTuple):
     c_n: float  # [N]
     jammed: bool  # whether friction jams a direction of motion
     c_t: float | None = None  # [N]: of a rolling contact that slips under `c_n`
+    closing: str = ""  # the limit without which the formation would start
 
 
 class StartMode(NamedTuple):
@@ -420,7 +421,7 @@ class Rest(Statics):
         jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         moving = [mode for mode in self.list_modes() if mode.slides(tau)]
-        pulls = self.touching.find_pulls(tau)
+        pulls = self.touching.find_pulls(tau, count)
         if moving or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in moving or self.sliding), key=np.min)
@@ -431,8 +432,14 @@ class Rest(Statics):
                 k = int(np.minimum(*cones).argmin())
                 row, c_t = self.formation.rolling_rows[k], float(cones[1][k] - cones[0][k]) / 2
             return Collapse(x, self.formation.names[row], float(normal[row]), jams, c_t)
-        row = int(pulls.argmax())
-        return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
+        row, closing, n_open = int(pulls.argmax()), "", len(self.opening[0])
+        near = np.setdiff1d(np.flatnonzero(self.near), self.opening[1])
+        for mode in self.list_modes() if n_open else ():
+            others, openings = np.split(mode.margins @ [1.0, *tau], [-n_open])
+            if mode.response.ratio > 0 and (others >= 0).all():
+                closing = self.formation.limits[near[openings.argmin()]].text
+        pull = -float(pulls[row])
+        return Collapse(x, self.formation.names[row], pull, jams, closing=closing)
 
 
 def _split(polynomials: Array, x: float) -> tuple[Array, Array]:

@@ -250,6 +250,10 @@ class Replay(Run):
         text = self.note(EventKind.CONTACT_LOST, f"c_n of {contact} falls {suffix}", contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
+    def reach_limit(self, text: str) -> Outcome:
+        """End at a limit of the formation."""
+        return Outcome(OutcomeKind.LIMIT_REACHED, self.note(EventKind.LIMIT, text))
+
     def release(self, c_n: float) -> Stop:
         """End the phase by the release of contacts; `c_n`: the least that they need [N]."""
         names = ", ".join(self.releasable)
@@ -408,6 +412,8 @@ class Replay(Run):
             return self.fail_by_slip(row, change.c_n, change.c_t)
         if change.contact in self.releasable:
             return self.release(change.c_n)
+        if change.closing:
+            return self.reach_limit(change.closing)
         return self.lose(change.contact, change.c_n)
 
     def move(self) -> Ending:
@@ -526,10 +532,9 @@ class Replay(Run):
         bounds = [k - cone.start for k in rows if cone.start <= k < cone.stop]
         if any(mode.is_rolling(k % len(mode.holders)) for k in bounds):
             return self.slip()
-        limits = [] if bounds else [k for k in rows if limit.start <= k < limit.stop]
-        if limits:
-            text = self.note(EventKind.LIMIT, self.ends.texts[limits[0] - limit.start])
-            return Outcome(OutcomeKind.LIMIT_REACHED, text)
+        reached = [] if bounds else [k for k in rows if limit.start <= k < limit.stop]
+        if reached:
+            return self.reach_limit(self.ends.texts[reached[0] - limit.start])
         rate_rows, free = self._select_rates(rows), self.formation.n_constraints < 4
         if rate_rows and not free and self.phase.end is End.SMOOTH and self.has_arrived():
             # Phase 1 of scene 584 of seed 1128 turns 5 nm before its end, for the least time.

@@ -141,13 +141,15 @@ class Run(ABC):
         return self.decisions <= 60
 
     def tau(self, t: float) -> Array:
-        """Torques at `t`, extrapolated beyond their next step, shape (2,) [N m]."""
-        piece, t = self.piece, min(t, self.breaks[-1])
-        # Ramps between contact modes may be shorter than the lookahead of mode choices.
+        """Torques at `t`, held from where they step next, shape (2,) [N m]."""
+        piece = self.piece
+        # Ramps between contact modes may be shorter than the lookahead of mode choices. Polynomials
+        # are not extrapolated beyond their pieces, which may be shorter still after a step.
         while t > self.breaks[piece + 1] and piece + 2 < len(self.breaks):
             if self.feedback is not None or self.steps_at[piece + 1]:
                 break
             piece += 1
+        t = min(t, self.breaks[piece + 1])
         coefficients, x = self.torque.coefficients[piece], self.fraction(t, piece)
         return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
 

@@ -36,7 +36,7 @@ from ...contacts.contact_limits import build_limits, list_renamed
 from ...contacts.elemental import Contact, build_features
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, find_vanishing, tangent_basis
-from ...mechanics.dynamics import build_force_rows
+from ...mechanics.dynamics import build_force_rows, forward
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...problem.definition import Until
 from ..nlp import (
@@ -233,6 +233,8 @@ def build_time_nlp(
         add_periods(rows, stages, layouts)
     if with_statics:
         hold_ends(rows, stages, layouts, scheme, target.epsilon)
+    elif not stages[0].smoothing:
+        keep_open(rows, stages[0], layouts[0])
     if target.has_margin:
         cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
@@ -574,6 +576,26 @@ def hold_ends(
         largest = 1 - np.minimum(0.05, rate * scene.actuator_lag[joints] / limit)
         bounds = rows.linear(len(joints), low=-largest, high=largest)
         rows.add_entries(bounds, layouts[0].tau[0, 0, joints], 1 / limit)
+
+
+def keep_open(rows: NlpRows, stage: Stage, layout: StageLayout) -> None:
+    """Add rows, linear in the first torques, for gaps closed at the start at rest: none closes.
+
+    Before the first point a gap could, and would press in the replay. Case: a pentagon of 9 cm
+    whose v4 comes to the tip of finger 2 where v2 touches finger 1.
+    """
+    formation, scene, tau = stage.formation, stage.formation.scene, layout.tau[0, 0]
+    touching = np.abs(formation.evaluate_limits(stage.guess.nodes[:1, 0])[0]) < scene.touching
+    touching[: sum(len(build_limits(contact, scene)) for contact in formation.contacts)] = False
+    gained = [formation.limits[k].gained for k in np.flatnonzero(touching)]
+    if contacts := tuple(contact for contact in gained if contact is not None):
+        z, v = np.repeat(stage.guess.nodes[:1], 3, axis=0).swapaxes(0, 1)
+        torques = np.vstack([np.zeros(2), np.eye(2)])
+        a, _ = forward(formation, formation.evaluate(z, v), v, torques, stage.directions)
+        opening = Formation(scene, contacts).evaluate(z, v).A[0] @ a.T
+        slopes = opening[:, 1:] - opening[:, :1]
+        starts = rows.linear(len(contacts), low=-opening[:, 0], high=np.inf)
+        rows.add_entries(starts[:, None], tau, slopes)
 
 
 def find_zero_bounds(stage: Stage, limits: LimitSet) -> Flags:
