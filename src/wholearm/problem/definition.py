@@ -311,6 +311,7 @@ class Problem:
         ------
         InputError  if a name is unknown, a value is not allowed, or the problem has no table
         """
+        check_kinds(Problem.with_.__annotations__, {"changes": changes})
         if not self.table:
             raise InputError(self.source, "", "the problem has no table that could be changed")
         from .read import build_problem, name_keys
