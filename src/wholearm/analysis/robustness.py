@@ -38,6 +38,10 @@ from ..verification.free import END_ANGLE, END_SHIFT, GRACE, find_touch, list_al
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
 
+SEED = Range(0, 2**63)
+"""Seeds of samples."""
+
+
 def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:
     """Samples of a Latin hypercube, shape (count, size), in [0, 1).
 
@@ -438,7 +442,7 @@ def assess_robustness(
     being written by another run, or cannot be written.
     """
     problem, trajectory = adopt_motion(problem, plan)
-    Range(1, 10**6).read(samples, "samples")
+    samples, seed = Range(1, 10**6).read(samples, "samples"), SEED.read(seed, "seed")
     trial_uncertainty = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, trial_uncertainty, phase, policy)
     with Journal(os.fspath(path or os.devnull), _stamp(trial, seed), fresh) as journal:

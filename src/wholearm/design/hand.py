@@ -247,7 +247,8 @@ def design_hand(
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     choice("time", "effort", "-margin").read(minimise, "--minimise")
-    for key, number in (("starts", starts), ("budget", budget)):
+    counts = {"problems: COUNT": len(listed), "--over: COUNT": len(over)}
+    for key, number in (counts | {"starts": starts, "budget": budget}).items():
         Range(1, 10**5).read(number, key)
     factors = np.array(weights if len(weights) else np.ones(len(listed)), dtype=float)
     if len(factors) != len(listed) or not (factors > 0).all():
