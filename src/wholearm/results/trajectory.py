@@ -360,7 +360,8 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
         if array.dtype.kind != "U":
             raise InputError(source, name, "does not hold text")
     elif array.dtype.kind not in ("iu" if name == "phase" else "iuf"):
-        raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
+        needed = "integers" if name == "phase" else "numbers"
+        raise InputError(source, name, f"holds {array.dtype}; {needed} are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
     # Problems have no larger distances or angles.

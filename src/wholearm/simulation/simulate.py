@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, SimulationError, require_number
+from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import measure_gaps
 from ..problem.definition import Problem
@@ -88,8 +89,7 @@ def simulate(
     """
     if contacts not in ("prescribed", "free"):
         raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
-    if not 1e-14 <= tolerance <= 1e-2:
-        raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
+    tolerance = Range(1e-14, 1e-2).read(tolerance, "tolerance")
     wanted = np.asarray(() if times is None else times, dtype=float)
     if not np.isfinite(wanted).all():
         raise InputError("", "times", "holds numbers that are not finite")
@@ -110,8 +110,7 @@ def simulate(
         text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
         raise InputError("", "start", text)
     state = np.concatenate([state, np.zeros(10 - len(state))])
-    if require_number(restitution, "restitution", nonnegative=True) > 1:
-        raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
+    restitution = SHARE.read(restitution, "restitution")
     end = None if until is None else require_number(until, "until", positive=True)
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
     options |= {"wanted": wanted, "halt": halt}
