@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array, sort_unique
-from ..common.errors import InputError, SimulationError, require_number
+from ..common.errors import InputError, SimulationError, require_array, require_number
 from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import measure_gaps
@@ -90,7 +90,7 @@ def simulate(
     if contacts not in ("prescribed", "free"):
         raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
     tolerance = Range(1e-14, 1e-2).read(tolerance, "tolerance")
-    wanted = np.asarray(() if times is None else times, dtype=float)
+    wanted = require_array(np.atleast_1d([] if times is None else times), "times", -1)
     if not np.isfinite(wanted).all():
         raise InputError("", "times", "holds numbers that are not finite")
     wanted = sort_unique(wanted)
@@ -102,11 +102,8 @@ def simulate(
         require_phases(problem)
         run = Replay(problem, profile, tolerance, wanted, minima)
         return _conclude(run, problem, *run.play(progress))
-    try:
-        state = np.asarray(problem.start if start is None else start, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("", "start", "does not hold numbers") from None
-    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+    state = require_array(problem.start if start is None else start, "start", -1)
+    if state.size not in (5, 10) or not np.isfinite(state).all():
         text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
         raise InputError("", "start", text)
     state = np.concatenate([state, np.zeros(10 - len(state))])
