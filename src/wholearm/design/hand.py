@@ -210,7 +210,9 @@ class Design(Result):
             change = f"{abs(rise):.2f} % {'more' if rise > 0 else 'less'} than today's {today:.6g}"
             change = change if math.isfinite(today) else "no plan today"
             lines.append(f"{plan.headline}; {change}")
-        return Document("", parts=[*tables, *lines])
+        names = ", ".join(plan.problem.name for plan in self.plans)
+        reason = f"{self.label} = {optima[0].cost:.6g}"
+        return Document(names, reason=reason, parts=[*tables, *lines])
 
 
 @exclusive
