@@ -22,7 +22,7 @@ from .. import __version__
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
-from ..common.fields import Field, Range
+from ..common.fields import SEED, Field, Range
 from ..common.parallel import DiedError, Journal, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ClosedLoop, Policy
@@ -36,10 +36,6 @@ from ..simulation.simulate import simulate_free
 from ..verification.free import END_ANGLE, END_SHIFT, GRACE, find_touch, list_aliases, list_gained
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
-
-
-SEED = Range(0, 2**63)
-"""Seeds of samples."""
 
 
 def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:

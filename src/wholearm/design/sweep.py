@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..analysis.robustness import SEED, draw_cube
+from ..analysis.robustness import draw_cube
 from ..common.document import Document, Result, Table, format_csv, show, to_plain
 from ..common.errors import (
     InfeasibleError,
@@ -36,7 +36,7 @@ from ..common.errors import (
     require_number,
     suggest,
 )
-from ..common.fields import POINT, Field, Range, choice
+from ..common.fields import POINT, SEED, Field, Range, choice
 from ..common.files import number_same
 from ..common.parallel import Journal, Processes, run_all
 from ..mechanics.limits import make_limits
