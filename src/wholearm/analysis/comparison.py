@@ -22,7 +22,7 @@ from ..verification.verify import verify
 
 SIMULATIONS = "simulations"
 """Key of the number of simulations, in comments of torques and in the `meta` of a trajectory."""
-Source = str | os.PathLike[str] | Torques  # a file, or an object with torques
+PathOrTorques = str | os.PathLike[str] | Torques  # a file, or an object with torques
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class Comparison(Result):
 
 
 def compare(
-    problem: Problem, paths: Sequence[Source], progress: Callable[[str], None] | None = None
+    problem: Problem, paths: Sequence[PathOrTorques], progress: Callable[[str], None] | None = None
 ) -> Comparison:
     """Replay trajectory files (.npz), torques (.csv), plans and trajectories, and compare them.
 
@@ -137,7 +137,7 @@ def compare(
     return Comparison(problem.name, problem.epsilon, tuple(contenders))
 
 
-def _judge(name: str, problem: Problem, source: str, what: Source) -> Contender:
+def _judge(name: str, problem: Problem, source: str, what: PathOrTorques) -> Contender:
     """The replay of a trajectory or of torques, in numbers.
 
     The phases of a trajectory with forces replace a goal of the problem.

@@ -17,6 +17,7 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _BUILT_IN: dict[str, Any] = {"str": str, "Path": os.PathLike, "PathLike": os.PathLike}
 _BUILT_IN |= {"tuple": tuple | list, "Mapping": Mapping, "Callable": Callable}
+_CLASSES = {*wholearm.__all__, "Figure"}
 
 
 def _fits(value: Any, kind: ast.expr) -> bool:
@@ -42,8 +43,8 @@ def _fits(value: Any, kind: ast.expr) -> bool:
         case ast.Name(name) | ast.Attribute(attr=name):
             if name in _BUILT_IN:
                 return isinstance(value, _BUILT_IN[name])
-            known = name in (*wholearm.__all__, "Figure")
-            return not known or name in (ancestor.__name__ for ancestor in type(value).__mro__)
+            classes = (ancestor.__name__ for ancestor in type(value).__mro__)
+            return name not in _CLASSES or name in classes
     return True
 
 
