@@ -425,6 +425,10 @@ def test_what_only_objects_can_say_wrongly() -> None:
         (lambda: public.solve(None), "problem: None given; allowed: Problem"),
         (lambda: public.verify(given, "a"), "what: 'a' given; allowed are a plan, a simulation, a"),
         (lambda: public.load(True), "path: True given; allowed: str, Path"),
+        (lambda: public.sweep(given, {"mass": 1}), "vary: .* given; allowed: Mapping.str, S"),
+        (lambda: public.design_hand(given, "mass=1:2"), "over: .* given; allowed: Sequence.str"),
+        (lambda: public.TorqueProfile.join_rows([[1, 0, 0], [0, 0, 0]]), "breaks: .* increase"),
+        (lambda: replace(given, epsilon=-1), "epsilon: -1 is not a number >= 0"),
         (lambda: public.read_until(None, {"x": 0.1}), "scene: None given; allowed: Scene"),
         (lambda: public.place_start(given.scene, -1, 0.0), "start.flush: -1 is not an edge"),
         (lambda: public.list_formations(given, (0.1,), (0.2, 0.0)), "is not a list of 2 numbers"),
@@ -774,7 +778,7 @@ def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:
     assert found.table["phases"] == planned.table["phases"] and not found.goals
     assert adopt_phases(planned, plan.meta, plan.q[-1]) is planned
     plan.save(tmp_path / "plan.npz")
-    (own,) = compare(problem, [str(tmp_path / "plan.npz")]).contenders
+    own, _ = compare(problem, [plan, tmp_path / "plan.npz"]).contenders
     assert own.ok and len(own.lasts) == 5
     for goal in ({"phi_deg": phi + 1.0}, {"phi_deg": phi, "x": plan.q[-1, 0] + 1e-3}, {"flush": 6}):
         with pytest.raises(InputError, match=r"goal: the plan ends at .*, and not with"):

@@ -267,7 +267,7 @@ def test_constant_torques_do_not_come_to_rest() -> None:
     found = wholearm.tune(light_box())
     assert not found.ok and found.exit_status == 1 and found.torque is None
     assert found.reason.startswith("phase 1: x = -0.01 m is reached at ")
-    with pytest.raises(ValueError, match="no torques"):
+    with pytest.raises(wholearm.WholearmError, match="no torques"):
         found.to_csv()
 
 
@@ -480,7 +480,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
         with pytest.raises(InputError, match=text) as caught:
             compare(other, [moved])
         assert caught.value.source == moved
-    compare(problem.with_(epsilon=0.01, name="other"), [moved])
+    json.dumps(compare(problem.with_(epsilon=0.01, name="other"), [Path(moved)] * 2).to_dict())
     assert main(["compare", str(HEPTAGON), moved]) == 2
     assert "moved.npz: made for another problem: phases (1 entries" in capsys.readouterr().err
     odd = tmp_path / "odd.csv"

@@ -542,7 +542,7 @@ def test_a_plan_comes_back_from_another_process() -> None:
         with pytest.raises(wholearm.InputError, match=r"^file: gravity: is missing$"):
             pool.apply(_refuse, ("gravity",))
     assert theirs.meta["value"] == pytest.approx(_plan(problem).meta["value"], rel=1e-6)
-    with pytest.raises(ValueError, match="outside"):
+    with pytest.raises(InputError, match="outside"):
         theirs.at(-1.0)
     rows = np.flatnonzero(np.diff(theirs.t) > 0)[::50]
     for row in rows:

@@ -93,7 +93,7 @@ def test_at_reaches_the_end_and_no_farther(trajectory: Trajectory) -> None:
     end = trajectory.at(trajectory.duration)
     np.testing.assert_allclose(end.z, MOTIONS[1].evaluate(np.array([0.2])).z, atol=1e-14)
     for t in (-1e-9, trajectory.duration + 1e-9, float("nan")):
-        with pytest.raises(ValueError, match="outside the trajectory"):
+        with pytest.raises(InputError, match="outside the trajectory"):
             trajectory.at(t)
 
 
@@ -186,7 +186,7 @@ def test_bad_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str, c
         ("phase", np.array([0] * 9 + [10**12] * 9), "count up"),
         ("phase", np.array([0.0] * 9 + [1.0] * 9), "float64"),
         ("torque_breaks", np.array([0.0, 0.9, 0.7]), "increase"),
-        ("torque_breaks", np.array([0.0, 0.9]), "pieces"),
+        ("torque_breaks", np.array([0.0, 0.9]), "needed"),
         ("q", np.full((18, 3), -1.1e6), r"beyond 1e\+06, the"),
         ("c_n", np.full((18, 4), -1.1e30), r"beyond 1e\+30, the"),
         ("torque_coefficients", np.full((2, 2, 4), -1.1e30), r"beyond 1e\+30, the"),
@@ -198,7 +198,7 @@ def test_bad_value_is_named(
     np.savez(tmp_path / "a.npz", **(read_arrays(trajectory) | {name: value}))
     with pytest.raises(InputError, match=problem) as caught:
         load_trajectory(tmp_path / "a.npz")
-    assert caught.value.key == ("torque_coefficients" if problem == "pieces" else name)
+    assert caught.value.key == ("torque_coefficients" if problem == "needed" else name)
 
 
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 broken", None])

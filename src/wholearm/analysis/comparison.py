@@ -14,7 +14,7 @@ from ..common.errors import InputError, JammingError, SimulationError, name_sour
 from ..common.files import require_ending
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases, require_phases
-from ..results.adopt import require_made_for
+from ..results.adopt import Torques, require_made_for, split_torques
 from ..results.report import Report
 from ..results.torque import read_notes, read_torque_csv
 from ..results.trajectory import Trajectory, load_trajectory
@@ -22,6 +22,7 @@ from ..verification.verify import verify
 
 SIMULATIONS = "simulations"
 """Key of the number of simulations, in comments of torques and in the `meta` of a trajectory."""
+PathOrTorques = str | os.PathLike[str] | Torques  # a file, or an object with torques
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,41 +115,49 @@ class Comparison(Result):
 
 
 def compare(
-    problem: Problem, paths: Sequence[str], progress: Callable[[str], None] | None = None
+    problem: Problem, paths: Sequence[PathOrTorques], progress: Callable[[str], None] | None = None
 ) -> Comparison:
-    """Replay trajectory files (.npz) and torques (.csv) for a problem, and compare them.
+    """Replay trajectory files (.npz), torques (.csv), plans and trajectories, and compare them.
 
     `progress` is called with the name of each file before its replay.
 
     InputError if a file cannot be read, or a trajectory is one of another problem; names the file.
     """
-    short = [os.path.basename(path) for path in paths]
-    names = short if len({*short}) == len(short) else paths
+    sources = [
+        os.fspath(each) if isinstance(each, str | os.PathLike) else f"{type(each).__name__} {k}"
+        for k, each in enumerate(paths, start=1)
+    ]
+    short = [os.path.basename(source) for source in sources]
+    names = short if len({*short}) == len(short) else sources
     contenders = []
-    for name, path in zip(names, paths, strict=True):
+    for name, source, each in zip(names, sources, paths, strict=True):
         if progress is not None:
             progress(f"replaying {name}")
-        contenders.append(_judge(name, problem, str(path)))
+        contenders.append(_judge(name, problem, source, each))
     return Comparison(problem.name, problem.epsilon, tuple(contenders))
 
 
-def _judge(name: str, problem: Problem, path: str) -> Contender:
+def _judge(name: str, problem: Problem, source: str, what: PathOrTorques) -> Contender:
     """The replay of a trajectory or of torques, in numbers.
 
     The phases of a trajectory with forces replace a goal of the problem.
     """
-    planned = None
-    if require_ending(path, ".npz", ".csv") == ".csv":
-        note = read_notes(path).get(SIMULATIONS)
-        if note is not None and not note.isdecimal():
-            raise InputError(path, SIMULATIONS, f"{note!r} given; a whole number is needed")
+    simulations = None
+    if isinstance(what, str | os.PathLike):
+        if require_ending(what, ".npz", ".csv") == ".csv":
+            note = read_notes(source).get(SIMULATIONS)
+            if note is not None and not note.isdecimal():
+                raise InputError(source, SIMULATIONS, f"{note!r} given; a whole number is needed")
+            what, simulations = read_torque_csv(source), None if note is None else int(note)
+        else:
+            what = load_trajectory(what)
+    torque, planned = split_torques(what)
+    if planned is None:
         require_phases(problem)
-        torque, simulations = read_torque_csv(path), None if note is None else int(note)
     else:
-        planned = load_trajectory(path)
-        torque, meta = planned.torque, planned.meta
-        problem = adopt_phases(problem, meta, planned.q[-1], path)
-        with name_source(path):
+        meta = planned.meta
+        problem = adopt_phases(problem, meta, planned.q[-1], source)
+        with name_source(source):
             require_made_for(problem, meta)
         simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
         simulations = simulations if isinstance(simulations, int) else None

@@ -22,7 +22,7 @@ from .. import __version__
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
-from ..common.fields import Field, Range
+from ..common.fields import SEED, Field, Range
 from ..common.parallel import DiedError, Journal, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ClosedLoop, Policy
@@ -438,7 +438,7 @@ def assess_robustness(
     being written by another run, or cannot be written.
     """
     problem, trajectory = adopt_motion(problem, plan)
-    Range(1, 10**6).read(samples, "samples")
+    samples, seed = Range(1, 10**6).read(samples, "samples"), SEED.read(seed, "seed")
     trial_uncertainty = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, trial_uncertainty, phase, policy)
     with Journal(os.fspath(path or os.devnull), _stamp(trial, seed), fresh) as journal:

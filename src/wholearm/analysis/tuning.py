@@ -16,7 +16,7 @@ import numpy as np
 
 from ..common.arrays import Array, find_root
 from ..common.document import Document, Result, Table, fixed
-from ..common.errors import InputError, name_source
+from ..common.errors import InputError, WholearmError, name_source
 from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
 from ..geometry.tracing import EndDistance
@@ -207,10 +207,10 @@ class Tuning(Result):
     def to_csv(self) -> str:
         """The torques as a table, with comments on the number of simulations and on the raises.
 
-        ValueError if there are none.
+        WholearmError if there are none.
         """
         if self.rows is None:
-            raise ValueError("no torques were found")
+            raise WholearmError(f"no torques were found: {self.reason}")
         notes = [f"# simulations = {self.simulations}"]
         for phase in self.phases:
             text = f"finger {phase.acting} {phase.raised:+d}"

@@ -259,6 +259,21 @@ def require_vector(value: object, key: str, size: int) -> Array:
     return frozen([require_number(item, key) for item in value])
 
 
+def require_array(value: object, key: str, *shape: int, kind: type | None = float) -> Array:
+    """Return `value` as an array of a shape (-1: any size) and kind, or raise `InputError`."""
+    import numpy as np
+
+    try:
+        array = np.asarray(value, dtype=kind)
+    except (TypeError, ValueError):
+        raise InputError("", key, f"{value!r} is no array of numbers") from None
+    pairs = zip(shape, array.shape, strict=False)
+    if array.ndim != len(shape) or not all(size in (-1, n) for size, n in pairs):
+        text = ", ".join(str(n) if n >= 0 else "any" for n in shape)
+        raise InputError("", key, f"shape {array.shape} given, ({text}) needed")
+    return array
+
+
 def frozen(value: ArrayLike) -> Array:
     """Return a read-only float array."""
     import numpy as np

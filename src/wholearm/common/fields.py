@@ -136,6 +136,7 @@ def unread(schema: Schema) -> FieldKind:
 
 
 SHARE = Range(0.0, 1.0)
+SEED = Range(0, 2**63)  # of random numbers
 NUMBER = FieldKind(require_number, {"type": "number"})
 POSITIVE = FieldKind(
     partial(require_number, positive=True), {"type": "number", "exclusiveMinimum": 0}

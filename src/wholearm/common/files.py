@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from .arguments import checked
 from .errors import InputError, name_file
 from .signals import defer_signals, register_cleanup
 
@@ -35,6 +36,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
         raise InputError(target, "", f"cannot be written: no permission in {folder}")
 
 
+@checked
 def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
     """The extension of a file name in lower case, or an `InputError` if it is not allowed.
 

@@ -210,7 +210,9 @@ class Design(Result):
             change = f"{abs(rise):.2f} % {'more' if rise > 0 else 'less'} than today's {today:.6g}"
             change = change if math.isfinite(today) else "no plan today"
             lines.append(f"{plan.headline}; {change}")
-        return Document("", parts=[*tables, *lines])
+        names = ", ".join(plan.problem.name for plan in self.plans)
+        reason = f"{self.label} = {optima[0].cost:.6g}"
+        return Document(names, reason=reason, parts=[*tables, *lines])
 
 
 @exclusive
@@ -247,7 +249,8 @@ def design_hand(
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
     choice("time", "effort", "-margin").read(minimise, "--minimise")
-    for key, number in (("starts", starts), ("budget", budget)):
+    counts = {"problems: COUNT": len(listed), "--over: COUNT": len(over)}
+    for key, number in (counts | {"starts": starts, "budget": budget}).items():
         Range(1, 10**5).read(number, key)
     factors = np.array(weights if len(weights) else np.ones(len(listed)), dtype=float)
     if len(factors) != len(listed) or not (factors > 0).all():

@@ -36,7 +36,7 @@ from ..common.errors import (
     require_number,
     suggest,
 )
-from ..common.fields import POINT, Field, Range, choice
+from ..common.fields import POINT, SEED, Field, Range, choice
 from ..common.files import number_same
 from ..common.parallel import Journal, Processes, run_all
 from ..mechanics.limits import make_limits
@@ -44,7 +44,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import UNITS, Plan
 from ..problem.definition import Problem
 from ..problem.read import FINGER, FRICTION, OBJECT, START, TOP, UNTIL, name_keys
-from ..problem.table import describe_scene
+from ..problem.table import change_table, describe_scene
 from ..scene.model import CORNERS
 from ..search import solve
 
@@ -100,7 +100,7 @@ def require_allowed(problem: Problem, name: str, value: Any, label: str) -> None
     try:
         problem.with_({name: value})
     except InputError as error:
-        keys = name, *name_keys().get(name, ())
+        keys = "", name, *name_keys().get(name, ())
         if any(key.partition("[")[0] == error.key.partition("[")[0] for key in keys):
             raise InputError(problem.source, f"{label} {name}", error.problem) from None
 
@@ -391,6 +391,7 @@ def sweep(
     another sweep or anything else.
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    samples, seed = Range(0, 10**6).read(samples, "samples"), SEED.read(seed, "seed")
     for check in checks:
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
@@ -398,12 +399,16 @@ def sweep(
     axes = {name: tuple(to_plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
     for problem, (name, candidates) in product(listed[::-1], vary.items()):
+        Range(1, 10**6).read(len(candidates), f"--vary {name}: COUNT")
         numbers = all(isinstance(value, Real) and math.isfinite(value) for value in candidates)
         for value in (min(candidates), max(candidates)) if numbers else candidates:
             require_allowed(problem, name, value, "--vary")
         titles[name] = name
         with suppress(InputError):
             titles[name] = find_parameter(problem, name).title
+    for problem in listed:
+        # Two names may not change the same number.
+        change_table(problem.table, {name: values[0] for name, values in axes.items()}, name_keys())
     names = number_same([problem.source or problem.name for problem in listed], "{} ({})")
     combinations: Iterable[Point] = product(*axes.values())
     if samples:
@@ -411,7 +416,7 @@ def sweep(
             np.array([require_number(values[k], f"--vary {name}") for name, values in axes.items()])
             for k in (0, -1)
         )
-        cube = draw_cube(Range(1, 10**6).read(samples, "samples"), len(axes), seed)
+        cube = draw_cube(samples, len(axes), seed)
         combinations = (low + cube * (high - low)).tolist()
     points = [(index, *values) for index, values in product(range(len(listed)), combinations)]
     planner = Planner(listed, tuple(vary), chosen | {"time_limit": time_limit}, tuple(checks))

@@ -23,7 +23,7 @@ from ..common.arrays import Array, Flags, Numbers, find_runs, interpolate
 from ..common.sharing import exclusive
 from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
-from ..results.adopt import MotionLike
+from ..results.adopt import MotionLike, require_motion
 from ..results.trajectory import Trajectory
 from .style import INK, add_line, inset, open_figure, write, write_title
 
@@ -55,7 +55,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | MotionLike | None = None) -
     problem = chart.problem
     paths = trace_problem(problem) if plan is None else []
     if plan is not None:
-        motion = plan if isinstance(plan, Trajectory) else plan.trajectory
+        motion = require_motion(plan)
         paths = [motion.q[motion.phase == k][:, [0, 2]] for k in np.unique(motion.phase)]
     with open_figure(*SIZE) as figure:
         drawing = _Drawing(figure, chart, paths)

@@ -24,6 +24,7 @@ from matplotlib.scale import SymmetricalLogTransform
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
+from ..common.arguments import checked
 from ..common.arrays import Array, Numbers
 from ..common.document import fixed
 from ..common.errors import InputError, require_number
@@ -543,6 +544,7 @@ def force_margins(
     return figure
 
 
+@checked
 @exclusive
 def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180) -> None:
     """Write a figure as PNG, PDF or SVG, by the ending of `path`; equal figures, equal bytes.

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.arguments import checked
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source, require_number, require_vector
@@ -232,6 +233,7 @@ class Policy(Result):
         write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     @staticmethod
+    @checked
     def load(path: str | os.PathLike[str]) -> Policy:
         """Read a policy.
 

@@ -24,6 +24,7 @@ from ..common.fields import (
     choice,
     declare,
     key,
+    keys_of,
     refer,
     unread,
 )
@@ -248,7 +249,8 @@ class Problem:
     """A manipulation to plan; an `InputError` names the key of a value that is not allowed.
 
     Formations of the phases are moved to `scene`, so that `dataclasses.replace` returns a
-    consistent problem. It does not check values; `with_` does.
+    consistent problem. It checks kinds and signs of values; `with_` checks also their ranges, and
+    whether they go together.
     """
 
     name: str
@@ -267,6 +269,9 @@ class Problem:
     def __post_init__(self) -> None:
         with name_source(self.source):
             check_kinds(Problem.__annotations__, vars(self))
+            for attribute, declared in keys_of(Problem).items():
+                declared.read(getattr(self, attribute), declared.name)
+            object.__setattr__(self, "start", require_vector(self.start, "start", 5))
         phases = tuple(
             phase
             if phase.formation.scene is self.scene
@@ -279,7 +284,6 @@ class Problem:
         from .read import check_problem
 
         with name_source(self.source):
-            object.__setattr__(self, "start", require_vector(self.start, "start", 5))
             check_problem(self)
         object.__setattr__(self, "checked", True)
 
@@ -311,6 +315,7 @@ class Problem:
         ------
         InputError  if a name is unknown, a value is not allowed, or the problem has no table
         """
+        check_kinds(Problem.with_.__annotations__, {"changes": changes})
         if not self.table:
             raise InputError(self.source, "", "the problem has no table that could be changed")
         from .read import build_problem, name_keys

@@ -208,7 +208,7 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
 
 def _check_edge(scene: Scene, edge: object, key: str) -> None:
     count = scene.polygon.n_vertices
-    if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
+    if not isinstance(edge, int | np.integer) or isinstance(edge, bool) or not 0 <= edge < count:
         raise InputError("", key, f"{edge!r} is not an edge; allowed are 0 to {count - 1}")
 
 
@@ -344,8 +344,7 @@ def check_problem(problem: Problem) -> None:
     """Raise an `InputError` for the first invalid value; curves of phases are not traced."""
     check_ranges(problem.scene)
     for attribute, field in keys_of(Problem).items():
-        value = field.read(getattr(problem, attribute), field.name)
-        field.check(value, field.name, problem.scene)
+        field.check(getattr(problem, attribute), field.name, problem.scene)
     expand_widths(problem.uncertainty or {}, "uncertainty.{}")
     PLACE.check("start.x", float(problem.start[0]), "m", problem.scene)
     for index, phase in enumerate(problem.phases):

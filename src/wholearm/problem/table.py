@@ -107,7 +107,7 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
         for goal in problem.goals
     ]
-    goals = [{key: goal[key] for key in goal if goal[key] is not None} for goal in goals]
+    goals = [{k: to_plain(goal[k]) for k in goal if goal[k] is not None} for goal in goals]
     if goals:
         table["goal"] = goals[0] if len(goals) == 1 else goals
     elif problem.phases:

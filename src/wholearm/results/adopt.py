@@ -31,7 +31,7 @@ Torques = TorqueProfile | Trajectory | MotionLike  # objects that have torques
 def split_torques(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
     """Torques and trajectory of a plan, a replay or a trajectory; None for torques alone."""
     if isinstance(what, TorqueProfile):
-        return what, None
+        return what.check(), None
     trajectory = what if isinstance(what, Trajectory) else getattr(what, "trajectory", None)
     if not isinstance(trajectory, Trajectory):
         reason = "allowed are a plan, a simulation, a report, a Trajectory and a TorqueProfile"
@@ -52,14 +52,21 @@ def adopt_torques(
     return problem, torque, trajectory
 
 
+def require_motion(plan: Torques) -> Trajectory:
+    """The trajectory of a plan or a replay; an `InputError` if torques alone are given."""
+    _, trajectory = split_torques(plan)
+    if trajectory is None:
+        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    return trajectory
+
+
 def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
     """Problem and motion as of `adopt_torques`.
 
     InputError if torques alone are given, or the motion has other phases than the problem.
     """
-    problem, _, trajectory = adopt_torques(problem, plan)
-    if trajectory is None:
-        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    trajectory = require_motion(plan)
+    problem, *_ = adopt_torques(problem, trajectory)
     require_same_phases(problem, trajectory)
     return problem, trajectory
 

@@ -14,7 +14,7 @@ from typing import TextIO
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_file, require_number
+from ..common.errors import InputError, name_file, require_array, require_number
 from ..common.fields import choice
 
 ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
@@ -35,6 +35,21 @@ class TorqueProfile:
     breaks: Array  # (k + 1,) [s]: strictly increasing; torques are smooth between them
     # (k, 2, d + 1) [N m]: ascending powers of x = (2 t - t_k - t_k+1) / (t_k+1 - t_k) on piece k
     coefficients: Array
+
+    def __post_init__(self) -> None:
+        breaks = require_array(self.breaks, "breaks", -1)
+        coefficients = require_array(self.coefficients, "coefficients", len(breaks) - 1, 2, -1)
+        object.__setattr__(self, "breaks", breaks)
+        object.__setattr__(self, "coefficients", coefficients)
+
+    def check(self) -> TorqueProfile:
+        """The torques; an `InputError` if breaks do not increase, or a number is not finite."""
+        if len(self.breaks) < 2 or not (np.diff(self.breaks) > 0).all():
+            raise InputError("", "breaks", "must be two or more, and increase")
+        for name in ("breaks", "coefficients"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError("", name, "holds numbers that are not finite")
+        return self
 
     def __repr__(self) -> str:
         return f"TorqueProfile({len(self.coefficients)} pieces, {self.duration:.6g} s)"
@@ -123,13 +138,15 @@ class TorqueProfile:
     def join_rows(rows: Array) -> TorqueProfile:
         """Linear torques between rows t, tau1, tau2, shape (n, 3) [s, N m, N m].
 
-        Times never decrease, and increase somewhere. Two rows at one time are a step there.
+        Two rows at one time are a step there. InputError if times decrease, or never increase, or
+        a number is not finite.
         """
+        rows = require_array(rows, "rows", -1, 3)
         t, tau = rows[:, 0], rows[:, 1:]
-        pieces = np.flatnonzero(np.diff(t) > 0)
+        pieces = np.flatnonzero(np.diff(t))
         middle, half = (tau[pieces] + tau[pieces + 1]) / 2, (tau[pieces + 1] - tau[pieces]) / 2
         breaks = np.append(t[pieces], t[-1])
-        return TorqueProfile(breaks, np.stack([middle, half], axis=2))
+        return TorqueProfile(breaks, np.stack([middle, half], axis=2)).check()
 
 
 def read_torque_csv(path: str | Path) -> TorqueProfile:

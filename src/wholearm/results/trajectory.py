@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array, Flags, Numbers, sort_unique
 from ..common.document import Drawn, restore
-from ..common.errors import InputError
+from ..common.errors import InputError, name_source, require_array
 from ..common.files import read_arrays, require_ending, write_text, write_whole
 from .torque import MAX_NUMBER, TorqueProfile, format_rows, place_rows
 
@@ -166,13 +166,13 @@ class Trajectory(Drawn):
         At a phase boundary values are those of the later phase. Contacts are all those of the
         trajectory; forces are NaN if a contact is not in the formation.
 
-        ValueError if one of the times is outside the trajectory.
+        InputError if one of the times is outside the trajectory.
         """
-        times, starts = np.atleast_1d(np.asarray(t, dtype=float)), self.phase_starts
+        times, starts = require_array(np.atleast_1d(t), "t", -1), self.phase_starts
         inside = (times >= starts[0]) & (times <= starts[-1])
         if not inside.all():
             time = times[~inside][0]
-            raise ValueError(f"t = {time} s is outside the trajectory, 0 to {starts[-1]} s")
+            raise InputError("", "t", f"{time} s is outside the trajectory, 0 to {starts[-1]} s")
         phase_index = np.searchsorted(starts[1:-1], times, side="right")
         widths = 5, 5, 5, 2, len(self.contacts), len(self.contacts)
         fields = Samples(*(np.empty((len(times), width)) for width in widths))
@@ -342,7 +342,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     contacts = tuple(str(name) for name in arrays["contacts"])
     pairs = ((arrays[f"q{dots}"], arrays[f"theta{dots}"]) for dots in ("", "_dot", "_ddot"))
     samples = Samples(*map(np.hstack, pairs), *(arrays[name] for name in ("tau", "c_n", "c_t")))
-    torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
+    with name_source(source, "torque_"):
+        torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"]).check()
     motions = sample_phases(arrays["t"], arrays["phase"], samples, contacts, torque)
     columns = samples._asdict() | {"t": arrays["t"], "phase": arrays["phase"]}
     return Trajectory(**columns, contacts=contacts, torque=torque, motions=motions, meta=meta)
@@ -352,15 +353,14 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
     array = arrays[name]
     rows = arrays["t"].size if name in _ARRAYS else -1
     expected = rows, *((arrays["contacts"].size,) if name in ("c_n", "c_t") else tail)
-    pairs = zip(expected, array.shape, strict=False)
-    if array.ndim != len(expected) or not all(size in (-1, n) for size, n in pairs):
-        text = ", ".join(str(n) if n >= 0 else "any" for n in expected)
-        raise InputError(source, name, f"shape {array.shape} given, ({text}) needed")
+    with name_source(source):
+        require_array(array, name, *expected, kind=None)
     if name == "contacts":
         if array.dtype.kind != "U":
             raise InputError(source, name, "does not hold text")
     elif array.dtype.kind not in ("iu" if name == "phase" else "iuf"):
-        raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
+        needed = "integers" if name == "phase" else "numbers"
+        raise InputError(source, name, f"holds {array.dtype}; {needed} are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
     # Problems have no larger distances or angles.
@@ -383,9 +383,3 @@ def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
     if t[0] != 0 or (steps < 0).any() or (repeats & (np.append(repeats[1:], False) | ~last)).any():
         text = "must start at 0 and increase within each phase, a time given twice being a step"
         raise InputError(source, "t", text)
-    breaks = arrays["torque_breaks"]
-    if len(breaks) < 2 or (np.diff(breaks) <= 0).any():
-        raise InputError(source, "torque_breaks", "must be two or more, and increase")
-    if len(arrays["torque_coefficients"]) != len(breaks) - 1:
-        count, expected = len(arrays["torque_coefficients"]), len(breaks) - 1
-        raise InputError(source, "torque_coefficients", f"{count} pieces given, {expected} needed")

@@ -24,6 +24,7 @@ import numpy as np
 
 from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError, name_source
+from ..common.fields import Range
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, interrupt_at_beat, interruptible, limit_time
@@ -90,8 +91,7 @@ def find_route(
     SolverError      if there is no plan at the time limit; names the missing part
     """
     for name, number, low in (("jobs", jobs, 1), ("alternatives", alternatives, 0)):
-        if not isinstance(number, int) or number < low:
-            raise InputError("", name, f"{number!r} given; allowed is an integer from {low} up")
+        Range(low, 256).read(number, name)
     settings = PlanOptions(objective=objective, **options)
     with interruptible(), limit_time(time_limit):
         report = Reporter(progress)

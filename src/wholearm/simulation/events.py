@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.arrays import Array, Numbers, find_runs
 from ..common.document import Drawn
-from ..common.errors import SimulationError
+from ..common.errors import InputError, SimulationError
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Samples, Trajectory, sample_phases
@@ -239,11 +239,11 @@ class Simulation(Drawn):
     def at(self, t: float) -> Array:
         """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
 
-        ValueError if `t` was not a requested instant and no step ends there.
+        InputError if `t` was not a requested instant and no step ends there.
         """
         index = int(np.searchsorted(self.t, t, side="right")) - 1
         if index < 0 or self.t[index] != t:
-            raise ValueError(f"t = {t} s was not recorded; ask for it with `times`")
+            raise InputError("", "t", f"{t} s was not recorded; ask for it with `times`")
         return np.concatenate([self.z[index], self.z_dot[index]])
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array, sort_unique
-from ..common.errors import InputError, SimulationError, require_number
+from ..common.errors import InputError, SimulationError, require_array, require_number
+from ..common.fields import SHARE, Range
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import measure_gaps
 from ..problem.definition import Problem
@@ -88,9 +89,8 @@ def simulate(
     """
     if contacts not in ("prescribed", "free"):
         raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
-    if not 1e-14 <= tolerance <= 1e-2:
-        raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    instants = np.asarray(() if times is None else times, dtype=float)
+    tolerance = Range(1e-14, 1e-2).read(tolerance, "tolerance")
+    instants = require_array(np.atleast_1d([] if times is None else times), "times", -1)
     if not np.isfinite(instants).all():
         raise InputError("", "times", "holds numbers that are not finite")
     instants = sort_unique(instants)
@@ -102,16 +102,12 @@ def simulate(
         require_phases(problem)
         run = Replay(problem, profile, tolerance, instants, minima)
         return _conclude(run, problem, *run.play(progress))
-    try:
-        state = np.asarray(problem.start if start is None else start, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("", "start", "does not hold numbers") from None
-    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+    state = require_array(problem.start if start is None else start, "start", -1)
+    if state.size not in (5, 10) or not np.isfinite(state).all():
         text = f"shape {state.shape} given; 5 or 10 finite numbers are needed"
         raise InputError("", "start", text)
     state = np.concatenate([state, np.zeros(10 - len(state))])
-    if require_number(restitution, "restitution", nonnegative=True) > 1:
-        raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
+    restitution = SHARE.read(restitution, "restitution")
     end = None if until is None else require_number(until, "until", positive=True)
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
     options |= {"times": instants, "halt": halt}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
@@ -78,7 +78,14 @@ def verify(
 ) -> results.Report: ...
 @overload
 def verify(
-    problem: Problem, what: Torques, *, contacts: Literal["free"], **options: Any
+    problem: Problem,
+    what: Torques,
+    *,
+    contacts: Literal["free"],
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    restitution: float = 0.0,
+    progress: Callable[[str], None] | None = None,
 ) -> FreeReport: ...
 @exclusive
 def verify(
@@ -91,7 +98,8 @@ def verify(
     rest_speed: float = REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
-    **options: Any,
+    restitution: float = 0.0,
+    progress: Callable[[str], None] | None = None,
 ) -> results.Report | FreeReport:
     """Report on an open-loop simulation of a plan or of torques.
 
@@ -113,6 +121,7 @@ def verify(
     uniqueness_margin  least uniqueness margin of contact forces (`mechanics.uniqueness`)
     reduced            whether to list the paper's scalar equation of motion along phases with four
                        constraints
+    restitution        with free contacts, as progress, as of `verify_free`
 
     InputError if the trajectory has other contacts than the problem, or a number is out of its
     range; JammingError, SimulationError if the simulation cannot go on.
@@ -120,9 +129,10 @@ def verify(
     if contacts == "free":
         from .free import verify_free
 
-        return verify_free(problem, what, tolerance=tolerance, departure=departure, **options)
-    if contacts != "prescribed" or options:
-        text = f"{', '.join(options)} needs free ones" if options else f"{contacts!r} given"
+        values = {"tolerance": tolerance, "departure": departure, "restitution": restitution}
+        return verify_free(problem, what, progress=progress, **values)
+    if contacts != "prescribed" or restitution:
+        text = "restitution needs free ones" if restitution else f"{contacts!r} given"
         raise InputError("", "contacts", f"{text}; allowed are prescribed and free")
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
