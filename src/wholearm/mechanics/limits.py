@@ -35,7 +35,6 @@ class MotionLimit:
     scale: float  # unit of shortfalls
     parameter: Parameter  # the single number whose change relaxes it
     weight: Array  # (r,): by how much its bounds give way per unit of that
-    drags: bool = False  # whether its forces depend on the speed itself, and not only on its square
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.arrays import Array, Flags, Numbers
 from ..contacts.formation import Formation
-from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
+from .dynamics import LAMBDA, ONE, A, B, PathForces, V, apply
 from .limits import EPSILON, PRESS, LimitSet, make_limits
 
 TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
@@ -44,7 +44,7 @@ class PathLimits(NamedTuple):
         They are relaxed by `give`, over their scales.
         """
         bounds, speeds = limits.split(2)
-        rows = find_slack_rows(bounds, forces, rates)
+        rows = find_slack_rows(bounds, find_value_rows(bounds, forces, rates))
         rows[..., ONE] += give
         return PathLimits(rows, (1 + give) * find_speed_cap(speeds, rates))
 
@@ -108,7 +108,7 @@ class PathLimits(NamedTuple):
 
     def find_slack(self, a: Array, b: Array, internal: Array) -> Array:
         """Slack of the rows for a motion of shape (n,), over their scales, shape (n, m)."""
-        return np.asarray(np.einsum("nmi,ni->nm", self.rows, stack_motion(a, b, internal)))
+        return apply(self.rows, a, b, internal)
 
     def find_internal_force_range(self, a: Array, b: Array) -> tuple[Array, Array]:
         """Least and largest lambda that the rows allow for a motion, (n,); crossed if none."""
@@ -163,10 +163,9 @@ def find_value_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array
     return np.asarray(limits.rows @ np.concatenate([forces.of_c, forces.of_tau, turn], axis=1))
 
 
-def find_slack_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
-    """Coefficients of the slack of each side over its scale, shape (n, n_sides, 5)."""
-    slack = limits.find_slack_rows(find_value_rows(limits, forces, rates))
-    return np.asarray(slack / limits.side_scales[:, None])
+def find_slack_rows(limits: LimitSet, values: Array) -> Array:
+    """Slack of each side over its scale, (n, n_sides, 5), from values as of `find_value_rows`."""
+    return np.asarray(limits.find_slack_rows(values) / limits.side_scales[:, None])
 
 
 def find_speed_cap(limits: LimitSet, rates: Array) -> Array:
@@ -201,7 +200,7 @@ class InternalForceLimits(NamedTuple):
     def of(formation: Formation, forces: PathForces, rates: Array) -> InternalForceLimits:
         """Those of a formation at places with d theta / ds = `rates`, (n, 2)."""
         limits = make_limits(formation, 0.0)
-        rows = find_slack_rows(limits, forces, rates)
+        rows = find_slack_rows(limits, find_value_rows(limits, forces, rates))
         rows[..., LAMBDA] *= np.abs(rows[..., LAMBDA]) > FLAT
         return InternalForceLimits(limits, PathLimits(rows, np.full(len(rows), np.inf)))
 

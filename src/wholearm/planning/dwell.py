@@ -102,9 +102,8 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
     low, high = require_hold(data, phase, place)
     high = min(high, low + 40.0 * curve.formation.scene.scales.force)  # the widest range
     lams = low + np.linspace(0.01, 0.99, 129) * (high - low)  # those to try
-    forces = data.nodes.forces
-    T0, by_lambda = forces.of_tau[place, :, ONE], forces.of_tau[place, :, LAMBDA]
-    return T0 + np.outer(lams, by_lambda), lams
+    of_tau = data.of_tau[place]
+    return of_tau[:, ONE] + np.outer(lams, of_tau[:, LAMBDA]), lams
 
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:

@@ -32,6 +32,7 @@ from ..mechanics.dynamics import (
     Directions,
     PathForces,
     V,
+    apply,
     inverse,
     metric_weights,
     stack_motion,
@@ -176,7 +177,7 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         changes = np.array([*DOUBTS.values()])[:, None] * state.find_slopes(tuple(DOUBTS))
         delay = respond(forces, late)[0] - c
         changes = np.append(changes, delay[:, :, None], axis=2)
-        errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
+        errors = apply(changes, *motion)
         error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
         levels.append(slack / (SETTINGS.least * contact.side_scales + error)[..., None])
     before, after = map(np.hstack, sides)

@@ -26,13 +26,13 @@ from ..mechanics.dynamics import (
     LAMBDA,
     Directions,
     PathForces,
+    apply,
     forward,
     inverse,
     metric_weights,
-    stack_motion,
 )
 from ..mechanics.limits import SPEED, TORQUE, make_limits
-from ..mechanics.path_limits import find_slack_rows
+from ..mechanics.path_limits import find_slack_rows, find_value_rows
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
@@ -105,7 +105,7 @@ def find_internal_force(levels: Array, a: Array, b: Array) -> tuple[Array, Array
 
     `levels`, (n, m, 5), are limits over their margins, linear in (1, a, b, s', internal force).
     """
-    base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
+    base = apply(levels, a, b, np.zeros_like(b))
     lines = np.stack([base, levels[..., LAMBDA]], axis=2).tolist()
     level, internal = np.array([choose_internal_force(each) for each in lines]).T
     return level, internal
@@ -174,7 +174,8 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
         torque = np.isin(limits.sides[0], limits.of(TORQUE))
         margins = np.where(torque, ROOM, PRESS * weights)
-        levels = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
+        values = find_value_rows(limits, forces, v[:, 3:])
+        levels = find_slack_rows(limits, values) / margins[:, None]
         yield RegulatedStretch(formation, z, v, directions, forces, levels)
 
 

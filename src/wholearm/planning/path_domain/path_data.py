@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, find_minima
 from ...common.errors import InputError, JammingError, SolverError
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
+from ...mechanics.dynamics import apply, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
-from ..robust.robust_rows import RobustLimits, spread_limits
+from ..robust.robust_rows import COPIES, RobustLimits, find_least, spread_limits, widen
 from .path_motion import Elements, Grid, PathMotion, Profile
 
 PLACES = 13  # interpolation points where torques of a motion are not those through the knots
@@ -36,15 +36,9 @@ class Sampling(NamedTuple):
 class Places(NamedTuple):
     """Inverse dynamics at n places of a curve."""
 
-    of_c: Array  # of_c, of_tau: coefficients of forces, as in `PathForces`
-    of_tau: Array
+    values: Array  # (n, m, 5): coefficients of the limited values, of (1, s'', s'^2, s', lambda)
     rates: Array  # (n, 2): d theta / ds
-    variations: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
-
-    @property
-    def forces(self) -> PathForces:
-        """Contact forces and torques."""
-        return PathForces(self.of_c, self.of_tau)
+    variations: Array  # (n, k, 1 + p, 5): as of `robust_rows`, or none of shape (n, 0)
 
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
@@ -70,25 +64,26 @@ class PhaseData(NamedTuple):
         """Torque limits, shape (2,) [N m]."""
         return self.limits.high[self.limits.of(TORQUE)]
 
-    def find_terms(self) -> Array:
-        """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
-        return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
+    @property
+    def of_tau(self) -> Array:
+        """Coefficients of the torques at the nodes, shape (N + 1, 2, 5) [N m]."""
+        return self.nodes.values[:, self.limits.of(TORQUE)]
 
     def find_limits(self, places: Places) -> PathLimits:
         """The limits at places, with the internal force."""
-        rows = find_slack_rows(self.limits, places.forces, places.rates)
-        return PathLimits(rows, self.largest_b(places))
+        return PathLimits(find_slack_rows(self.limits, places.values), self.largest_b(places))
+
+    def find_tau(self, places: Places, profile: Profile) -> Array:
+        """Torques, shape (n, 2) [N m]."""
+        return apply(places.values[:, self.limits.of(TORQUE)], *profile)
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
-        rates = places.rates * np.sqrt(profile.b)[:, None]
-        forces = places.forces.c(*profile), places.forces.tau(*profile)
-        values = np.hstack([*forces, rates]) @ self.limits.rows.T
+        values = apply(places.values, *profile)
         if self.spread is not None:
-            least = self.spread.evaluate(places.forces, places.variations, profile)
-            rows = self.limits.of(PRESS, CONE)
-            values[:, rows] = np.repeat(least, len(rows) // least.shape[1], axis=1)
-        return np.asarray(values)
+            rows, least = self.limits.of(PRESS, CONE), find_least(places.variations, profile)
+            values[:, rows] = np.repeat(least, COPIES, axis=1)
+        return values
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
         """Slack of each side, less a `margin` of normal forces, shape (n, n_sides) [N, N m]."""
@@ -150,13 +145,15 @@ def prepare(
             f"phase {phase}: {' '.join(formation.names)} jams at {describe_pose(point.z[worst])}: "
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
-    forces = inverse(formation, point, directions)
+    forces, rates = inverse(formation, point, directions), point.z_s[:, 3:]
+    limits, speeds = make_limits(formation, epsilon).split(2)
     variations = np.zeros((len(s), 0))
     if spread is not None:
         variations = spread.find_variations(formation, point, directions, forces, epsilon)
-    every = Places(*forces, point.z_s[:, 3:], variations)
+    every = Places(find_value_rows(limits, forces, rates), rates, variations)
     added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
-    knots = every.pick(np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel())
+    rows = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel()
+    nodes, knots = every.pick(slice(None, len(grid.s))), every.pick(rows)
 
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
     to_checks, to_knots = (
@@ -169,18 +166,19 @@ def prepare(
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
         return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
-    nodes, checks = every.pick(slice(None, len(grid.s))), Places(*map(interpolate, knots))
-    limits = make_limits(formation, epsilon)
+    checks = Places(*map(interpolate, knots))
     if spread is not None:
-        limits = spread_limits(limits)
-        inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
-        nodes, checks = (
-            each._replace(of_c=spread.extend(each.of_c, each.variations, spread.pick_signs(*at)))
-            for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
+        at_nodes, at_checks = (grid.s, grid.segment), (interpolate(s[rows]), owners)
+        at_knots = s[rows], segment[rows]
+        nodes, knots, checks = (
+            each._replace(
+                values=widen(limits, each.values, each.variations, spread.pick_signs(*at))
+            )
+            for each, at in ((nodes, at_nodes), (knots, at_knots), (checks, at_checks))
         )
-    kept = limits.split(2)
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, spread)
+        limits = spread_limits(limits)
+    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, knots, checks, spread)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -225,10 +223,10 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
     if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
         raise SolverError("the motion all but stops between two nodes; plan with more intervals")
     breaks = np.append(motion.times[k], motion.times[-1])
-    values = data.knots.forces.tau(*data.interpolate(motion.profile, knots))
+    values = data.find_tau(data.knots, data.interpolate(motion.profile, knots))
     torque = _fit(breaks, spans, values)
     times = motion.times[k, None] + motion.durations(checks)
-    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
+    wanted = data.find_tau(data.checks, data.interpolate(motion.profile, checks))
     inner = np.tile((checks > 0) & (checks < 1), len(k))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
@@ -244,7 +242,7 @@ def find_torques(
     picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
     places, fractions = data.checks.pick(np.tile(picked, count)), checks[picked]
     spans = np.concatenate([motion.durations(fractions) for motion in motions])
-    values = places.forces.tau(*data.interpolate(profile, fractions))
+    values = data.find_tau(places, data.interpolate(profile, fractions))
     torque = _fit(np.append(0.0, np.cumsum(spans[:, -1])), spans, values)
     looks = np.linspace(-1, 1, LOOKS)
     return torque.at_places(looks), torque.slopes.at_places(looks)

@@ -26,7 +26,7 @@ import numpy as np
 from ...common.arrays import Array, Expression, Flags
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import LAMBDA, ONE, A, B, V, reduced_inertia
+from ...mechanics.dynamics import LAMBDA, ONE, A, B, reduced_inertia
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
@@ -174,10 +174,10 @@ def find_sure_start(
     margin : [N]  of normal forces over epsilon
     ranges        of parameters, within all of which it has to leave rest
     """
-    formation, forces = data.curve.formation, data.nodes.forces
+    formation, of_tau = data.curve.formation, data.of_tau[0]
     holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.lam[0]])
-    T0, T = forces.of_tau[0, :, ONE], forces.of_tau[0][:, [A, LAMBDA]]
+    T0, T = of_tau[:, ONE], of_tau[:, [A, LAMBDA]]
     scales, spans = formation.scene.scales, data.limits.side_scales
     if measure_holds(holds, T0 + T @ here) > SURE * scales.torque:
         return None
@@ -376,7 +376,8 @@ class PathIterate:
         # b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
         x, table = result["x"].full()[:, 0], np.zeros(nlp.free.shape)
         table[nlp.free] = x
-        profile = follow(self.data.grid, *(table[:, [1, 2]] * units.profile[1:]).T)
+        a, _, lam = (table[:, :3] * units.profile).T
+        profile = follow(self.data.grid, a, lam)
         margin = float(x[-1]) * units.force if self.goal is Objective.MARGIN else 0.0
         return replace(
             self,
@@ -399,25 +400,20 @@ class PathIterate:
             short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
             short += 0.05 * data.limits.scales
             table[:, nlp.node["extra"]] = short / units.of(data.limits)
-        table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
-        table[:, 0] /= data.grid.sizes
+        table[:, :3] = np.column_stack(profile) / units.profile
+        table[:, nlp.node["b"]] /= data.grid.sizes[:, None]
         return np.asarray(table[nlp.free])
 
     def find_parameters(self) -> Array:
         """Parameters of the NLP, in its units."""
         nlp, data, units = self.nlp, self.data, self.units
-        terms, unit = data.find_terms(), units.of(data.limits)
-        b_unit, a_unit, force = units.profile
-        torque, shape, scene = unit[list(nlp.shape.torques)], nlp.shape, data.curve.formation.scene
+        unit, shape, scene = units.of(data.limits), nlp.shape, data.curve.formation.scene
+        torque = unit[list(shape.torques)]
         blocks = {
-            "steps": data.grid.steps / units.length,
+            "lengths": np.diff(data.grid.edges) / units.length,
             "weight": np.array([self.task.options.time_weight / units.power]),
-            "calm": np.array([force / units.press]),
-            "a": terms[..., A] * a_unit / unit,
-            "b": terms[..., B] * b_unit / unit,
-            "lam": terms[..., LAMBDA] * force / unit,
-            "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, shape.fast],
-            "torque": data.nodes.forces.of_tau[..., ONE] / torque,
+            "calm": np.array([units.force / units.press]),
+            "terms": data.nodes.values * units.motion / unit[:, None],
             "joints": torque**2 / units.power,
             "quick": (torque / units.time / scene.torque_rate_limit)[list(shape.rates)],
             "lags": scene.actuator_lag[list(shape.commands)] / units.time,
@@ -429,54 +425,50 @@ class PathIterate:
     def make_bounds(self) -> dict[str, Array]:
         """Bounds of the NLP, with every limit tightened."""
         nlp, data, units, tightening = self.nlp, self.data, self.units, self.tightening
-        start, pins = self.task.start, self.task.pins
-        n, node = len(data.grid.s), nlp.node
+        start, n = self.task.start, len(data.grid.s)
         shares = np.broadcast_to(tightening.shares, (n, 5))
-        share, quickest, most = np.split(shares, [1, 3], axis=1)
-        low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
-        b_max = data.largest_b(data.nodes)
+        low, high = np.full((2, n, nlp.node.count), [[[-np.inf]], [[np.inf]]])
+        # Views of the columns.
+        (low_a, low_b, low_lam), (high_a, high_b, high_lam) = low.T[:3], high.T[:3]
         # Next to rest b is 2 s times the least s''.
         s, length = data.grid.s, data.grid.s[-1]
-        low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-        high[:, 0] = np.maximum(b_max * share[:, 0] / units.profile[0], 2 * LEAST_B)
+        low_b[:] = LEAST_B * np.minimum(s, length - s) / length
+        largest = data.largest_b(data.nodes) * shares[:, 0] / units.profile[1]
+        high_b[:] = np.maximum(largest, 2 * LEAST_B)
         if data.grid.held:
-            low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
+            low_b[:], high_b[:] = LEAST_B, high_b / data.grid.sizes
         # From rest to rest, without reversal.
         if nlp.shape.slow:
-            low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+            low_a[[0, -1]] = high_a[[0, -1]] = 0.0
         else:
-            low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+            low_a[0], high_a[-1] = LEAST_B, -LEAST_B
         if start is not None:
-            _, a_unit, force = units.profile
-            low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
-            low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
-        for place, pin in zip((0, -1), pins, strict=True):
+            low_a[0] = max(start.least_a / units.profile[0], LEAST_B)
+            low_lam[0], high_lam[0] = start.low / units.force, start.high / units.force
+        for place, pin in zip((0, -1), self.task.pins, strict=True):
             if pin is not None:
-                low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
-        low[:, node["extra"]] = -np.inf if self.goal is Objective.MARGIN else 0.0
+                low_lam[place] = high_lam[place] = pin / units.force
+        low[:, nlp.node["extra"]] = -np.inf if self.goal is Objective.MARGIN else 0.0
+        low_g, high_g = np.zeros((2, nlp.g.count))
         rows, signs, bounds = data.limits.sides
-        sides = bounds + signs * tightening.limits - data.find_terms()[:, rows, ONE]
-        sides /= units.of(data.limits)[rows]
-        side = np.arange(len(rows)) if self.goal is Objective.ELASTIC else rows
-        width = nlp.g.sizes["limits"] // n
-        rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
-        rows_low[:, side[signs > 0]] = sides[:, signs > 0]
-        rows_high[:, side[signs < 0]] = sides[:, signs < 0]
-        late = nlp.g.sizes["duration"]
-        equal = np.zeros(nlp.g["limits"].start)
-        longest = np.full(late, (self.task.duration or np.inf) * tightening.late / units.time)
-        rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
-        torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
-        most = most * data.torque_limit / torque
-        joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"], LEAST_B)
-        within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
-        motors_low, motors_high = (-within, joins, begins), (within, joins, np.inf * begins)
-        return {
-            "lbx": low[nlp.free],
-            "ubx": high[nlp.free],
-            "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
-            "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
-        }
+        unit = units.of(data.limits)
+        sides = (bounds + signs * tightening.limits) / unit[rows]
+        rows_low, rows_high = np.full((2, n, nlp.g.sizes["limits"] // n), [[[-np.inf]], [[np.inf]]])
+        highs = rows[signs < 0] + (nlp.shape.rows if self.goal is Objective.ELASTIC else 0)
+        rows_low[:, rows[signs > 0]], rows_high[:, highs] = (
+            sides[..., signs > 0],
+            sides[..., signs < 0],
+        )
+        low_g[nlp.g["limits"]], high_g[nlp.g["limits"]] = rows_low.ravel(), rows_high.ravel()
+        longest = (self.task.duration or np.inf) * tightening.late / units.time
+        low_g[nlp.g["duration"]], high_g[nlp.g["duration"]] = -np.inf, longest
+        most = data.torque_limit / unit[list(nlp.shape.torques)]
+        for name, columns in (("rates", shares[:, 1:3]), ("commands", shares[:, 3:] * most)):
+            within = columns[:, list(getattr(nlp.shape, name))].ravel("F")
+            low_g[nlp.g[name]], high_g[nlp.g[name]] = -within, within
+        low_g[nlp.g["begins"]], high_g[nlp.g["begins"]] = LEAST_B, np.inf
+        x = {"lbx": low[nlp.free], "ubx": high[nlp.free]}
+        return x | {"lbg": low_g, "ubg": high_g}
 
     def _center(self) -> dict[str, Array]:
         """Multipliers with which a motion is near the central path: none of the links b' = 2 a.
@@ -492,7 +484,7 @@ class PathIterate:
         for side, row in enumerate(rows.tolist()):
             on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
         on_x = np.zeros(nlp.free.shape)
-        on_x[:, 0] = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
+        on_x[:, 1] = -_CENTRAL / np.maximum(profile.b / units.profile[1], _SLACK)
         # The chain's multiplier at a node is the sum of those of normal forces from there on.
         chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
         multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
@@ -635,8 +627,8 @@ class PathIterate:
         on_b = np.zeros(nlp.free.shape)
         on_b[nlp.free] = self.multipliers["lam_x0"]
         on_shares = np.zeros((count, 5))
-        on_shares[:, 0] = np.maximum(on_b[:, 0], 0.0) * self.profile.b / data.grid.sizes
-        on_shares[:, 0] /= units.profile[0]
+        on_shares[:, 0] = np.maximum(on_b[:, 1], 0.0) * self.profile.b / data.grid.sizes
+        on_shares[:, 0] /= units.profile[1]
         for first, name, joints in (
             (1, "rates", nlp.shape.rates),
             (3, "commands", nlp.shape.commands),
@@ -670,10 +662,8 @@ class LimitShape(NamedTuple):
     """Structure of the limits that an NLP is built for."""
 
     rows: int  # number m of rows
-    sides: tuple[tuple[int, float], ...]  # row and sign of each, in the order of `LimitSet.sides`
     presses: tuple[int, ...]  # rows of the least normal forces
     torques: tuple[int, ...]  # rows of the torques
-    fast: tuple[int, ...]  # rows that depend on s'
     rates: tuple[int, ...]  # joints with a torque rate limit
     commands: tuple[int, ...]  # joints whose torques lag behind a command
 
@@ -681,16 +671,10 @@ class LimitShape(NamedTuple):
     def of(data: PhaseData) -> LimitShape:
         """The shape of the limits of phases and of their motors."""
         limits, scene = data.limits, data.curve.formation.scene
-        rows, signs, _ = limits.sides
-        # What depends on torques or speeds of the joints.
-        joints = limits.rows[:, -4:].any(axis=1)
-        drags = np.array([limits.limits[k].drags for k in limits.owners])
         return LimitShape(
             len(limits.low),
-            tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
-            tuple(np.flatnonzero(joints | drags).tolist()),
             tuple(np.flatnonzero(np.isfinite(scene.torque_rate_limit)).tolist()),
             tuple(np.flatnonzero(scene.actuator_lag).tolist()),
         )
@@ -701,24 +685,19 @@ class LimitShape(NamedTuple):
         return tuple(sorted({*self.rates, *self.commands}))
 
 
-def _find_lengths(h: Expression) -> Expression:
-    """Length of each element, shape (1, E)."""
-    return ca.sum1(ca.reshape(ca.vertcat(h, 0), NODES, -1))
-
-
-def _write_rises(a: Expression, h: Expression, maps: Expression) -> Expression:
+def _write_rises(a: Expression, lengths: Expression, maps: Expression) -> Expression:
     """Rise of b from each node to the next, shape (N,), on elements with `maps`, (3, E)."""
-    table, lengths, links = ca.reshape(a, NODES, -1), _find_lengths(h), find_basis().links
+    table, links = ca.reshape(a, NODES, -1), find_basis().links
     scales = [ca.repmat(maps[k, :] * lengths, DEGREE, 1) for k in range(3)]
     rises = sum(scale * (ca.DM(link) @ table) for scale, link in zip(scales, links, strict=True))
     return ca.vec(ca.vertcat(rises, ca.SX(1, lengths.numel())))[:-1]
 
 
 def _find_paces(
-    a: Expression, speed: Expression, h: Expression, maps: Expression, held: bool
+    a: Expression, speed: Expression, lengths: Expression, maps: Expression, held: bool
 ) -> Expression:
     """Rate dy/dt of the local variable at each node, times the element's length, (p + 1, E)."""
-    y, lengths = find_basis().y, _find_lengths(h)
+    y = find_basis().y
     stretches = ca.DM(np.column_stack([y**0, 2 * y, 3 * y**2])) @ maps
     paces = ca.reshape(speed, NODES, -1) / stretches
     # At rest speed and stretch vanish: s'' or its slope makes the speed a power of y there.
@@ -750,10 +729,15 @@ class Units(NamedTuple):
     press: float  # [N]: typical internal force, in the regularization
 
     @property
-    def profile(self) -> Array:
-        """Units of (b, a, internal force), shape (3,)."""
+    def motion(self) -> Array:
+        """Units of (1, a, b, s', internal force), shape (5,)."""
         speed = self.length / self.time
-        return np.array([speed**2, speed / self.time, self.force])
+        return np.array([1.0, speed / self.time, speed**2, speed, self.force])
+
+    @property
+    def profile(self) -> Array:
+        """Units of a `Profile`, shape (3,)."""
+        return self.motion[[A, B, LAMBDA]]
 
     def of(self, limits: LimitSet) -> Array:
         """Units of each row of limits, shape (m,)."""
@@ -777,25 +761,17 @@ class PathNLP:
     solver: Expression
     starter: Expression  # for points that are no solution, with slacks near the central path
     shape: LimitShape
-    intervals: int
-    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
+    # unknowns of each node: a, b over its size (none at the two ends), internal force, and `extra`:
     # shortfalls for `elastic`, or the least margin
     node: Columns
-    # `steps`, `weight` of time, unit of internal force in the regularization; constant torques and
-    # weights of joints for `effort`; coefficients of the limits at the nodes, column by column (the
-    # constant ones are part of the bounds); for rate limits 1 / these, lags, maps of elements and
-    # `sizes` of b
+    free: Flags  # (N + 1, columns): which entries of their table are unknowns
+    # `lengths` of elements, `weight` of time, unit of internal force in the regularization;
+    # coefficients of the limited values at the nodes, column by column; weights of joints for
+    # `effort`; for rate limits 1 / these, lags, maps of elements and `sizes` of b
     p: Columns
-    # b' = 2 a; the `chain` of the margin; node by node the `limits`, side by side where they are
-    # soft; the `duration` for `margin`; rate limits
+    # b' = 2 a; the `chain` of the margin; node by node the `limits`, where they are soft the lower
+    # ones, then the upper ones; the `duration` for `margin`; rate limits
     g: Columns
-
-    @cached_property
-    def free(self) -> Flags:
-        """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
-        mask = np.ones((self.intervals + 1, self.node.count), dtype=bool)
-        mask[[0, -1], self.node["b"]] = False
-        return mask
 
 
 @lru_cache(maxsize=16)
@@ -803,16 +779,15 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     """Build the NLP for every phase with limits of a shape."""
     started = time.perf_counter()
     n, m, slow = intervals + 1, shape.rows, shape.slow
+    weights = find_basis().weights
     effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
     soft = objective is Objective.ELASTIC
-    sizes = {"steps": intervals, "weight": 1, "calm": 1, "torque": n * 2, "joints": 2}
-    sizes |= {"a": n * m, "b": n * m, "lam": n * m, "speed": n * len(shape.fast)}
+    sizes = {"lengths": n // NODES, "weight": 1, "calm": 1, "terms": 5 * n * m, "joints": 2}
     sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
     p = Columns(**sizes, maps=3 * n // NODES, sizes=n)
     symbols = p.make_symbols()
     b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
     extra = ca.SX.sym("extra", n, m if soft else int(late))
-    h, fast = symbols.steps, list(shape.fast)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
     maps, scales = ca.DM(list_maps(np.zeros(n // NODES)).T), ca.DM.ones(n)
     if slow:
@@ -820,19 +795,14 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     b = ca.vertcat(0, b_inner * scales[1:-1], 0)
     speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
     largest = ca.fmax(scales[1:], scales[:-1])
-    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, maps, bool(slow))
-    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
-
-    def scale(name: str, column: Expression) -> Expression:
-        table = ca.reshape(getattr(symbols, name), n, -1)
-        return table * ca.repmat(column, 1, table.shape[1])
-
-    # Limits but for their constant part, which is in the bounds.
-    values = scale("a", a) + scale("b", b) + scale("lam", lam)
-    values[:, fast] += scale("speed", speed)
-    torques = values[:, list(shape.torques)] + ca.reshape(symbols.torque, n, 2)
-    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
+    lengths = symbols.lengths.T
+    paces, spans = _find_paces(a, speed, lengths, maps, bool(slow)), ca.DM(weights) @ lengths
+    times = ca.vec(spans / paces)
+    motion = dict(enumerate((ca.SX.ones(n), a, b, speed, lam)))
+    terms = ca.horzsplit(ca.reshape(symbols.terms, n, -1), m)
+    values = sum(table * ca.repmat(motion[k], 1, m) for k, table in enumerate(terms))
+    torques, scaled_lam = values[:, list(shape.torques)], symbols.calm * lam
+    node_costs = 2e-6 * ca.vec(spans) * scaled_lam**2  # among equal plans
     rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if soft:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
@@ -850,16 +820,14 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         # Not weighted by lengths, or shortfalls at short intervals would be cheap.
         node_costs += ca.sum2(extra) / n + 1e-4 * times
 
-    # Limits at the nodes, side by side where they are soft.
     limits = values
     if late:
         limits = values - extra @ ca.DM(np.isin(np.arange(m), shape.presses).astype(float)).T
     elif soft:
-        sides = [values[:, row] + sign * extra[:, row] for row, sign in shape.sides]
-        limits = ca.horzcat(*sides)
+        limits = ca.horzcat(values + extra, values - extra)
     none = ca.SX(0, 1)
     rows = {
-        "links": (b[1:] - b[:-1] - _write_rises(a, h, maps)) / largest,
+        "links": (b[1:] - b[:-1] - _write_rises(a, lengths, maps)) / largest,
         "chain": extra[1:] - extra[:-1] if late else none,
         "limits": ca.vec(limits.T),
         "duration": ca.sum1(times) if late else none,
@@ -876,9 +844,12 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     rows |= {name: ca.vertcat(none, *expressions) for name, expressions in motor_rows.items()}
     rows["begins"] = ca.vertcat(*find_first_slopes(a)) if slow else none
     g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
-    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
+    node = Columns(a=1, b=1, lam=1, extra=extra.shape[1])
+    free = np.ones((n, node.count), dtype=bool)
+    free[[0, -1], node["b"]] = False
+    every = ca.vec(ca.horzcat(a, ca.vertcat(0, b_inner, 0), lam, extra).T)
     nlp = {
-        "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
+        "x": every[np.flatnonzero(free).tolist()],
         "p": symbols.every,
         "f": ca.sum1(node_costs),
         "g": g.write(**rows),
@@ -897,8 +868,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         derived = {"jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l", "grad_f": "nlp_grad_f"}
         same = {key: solver.function.get_function(name) for key, name in derived.items()}
         starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
-    node = Columns(b=1, a=1, lam=1, extra=extra.shape[1])
-    return PathNLP(solver, starter, shape, intervals, node, p, g)
+    return PathNLP(solver, starter, shape, node, free, p, g)
 
 
 # Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one
@@ -968,7 +938,7 @@ def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
     duration, torque = np.pi / 2 * length / np.sqrt(height), data.torque_limit
     force = max(0.5 * weight, data.epsilon, float(np.abs(profile.lam).mean()))  # the least unit
-    squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
+    squares = np.minimum(np.abs(data.find_tau(data.nodes, profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
     most = max(force, float(np.abs(whole).mean()))
     return profile, Units(length, 0.6 * duration, force, torque, power, most)

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Numbers
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve, CurvePoint, directions_of
-from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
+from ...mechanics.dynamics import Directions, PathForces, apply, inverse
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
-from ...mechanics.path_limits import PathLimits
+from ...mechanics.path_limits import PathLimits, find_slack_rows, find_value_rows
 from ...mechanics.sensitivity import Sensitivity
 from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.definition import PARAMETERS, change_scene
@@ -60,10 +60,11 @@ class RobustLimits(NamedTuple):
         forces: PathForces,
         epsilon: float,
     ) -> Array:
-        """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
+        """Each force limit's rows h c, and their parametric bounds, shape (n, m, 1 + p, COUNT)."""
         slopes = Sensitivity.of_curve(formation, point, directions, forces).find_slopes(self.names)
         given = formation, self.rows, self.names, slopes, forces.of_c, epsilon
-        return find_variations(*given) * self.radii[:, None]
+        bounds, nominal = find_variations(*given) * self.radii[:, None], self.rows @ forces.of_c
+        return np.concatenate([nominal[:, :, None], bounds], axis=2)
 
     def pick_signs(self, s: Array, segment: Numbers) -> NDArray[np.int8]:
         """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
@@ -73,19 +74,6 @@ class RobustLimits(NamedTuple):
             places = self.s[table]
             rows[here] = table[np.searchsorted((places[1:] + places[:-1]) / 2, s[here])]
         return self.signs[rows]
-
-    def extend(self, of_c: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
-        """Contact forces with the robust value of each copy of each limit as further columns."""
-        spread = np.einsum("nmkp,nmpq->nmkq", signs, variations)
-        nominal = np.repeat(self.rows @ of_c, spread.shape[2], axis=1)
-        return np.concatenate([of_c, nominal - spread.reshape(nominal.shape)], axis=1)
-
-    def evaluate(
-        self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
-    ) -> Array:
-        """The left sides of the robust limits, shape (n, m) [N]."""
-        nominal = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
-        return np.asarray(nominal - np.abs(measure(variations, motion)).sum(axis=2))
 
 
 def find_variations(
@@ -114,28 +102,33 @@ def find_variations(
     return np.asarray(variations)
 
 
-def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
-    """Parametric bounds of a motion, shape (n, m, p) [N]."""
-    return np.asarray(np.einsum("nmpq,nq->nmp", variations, stack_motion(*motion)))
+def find_least(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
+    """The left sides of the robust limits, shape (n, m) [N]."""
+    amounts = apply(variations, *motion)
+    return np.asarray(amounts[..., 0] - np.abs(amounts[..., 1:]).sum(axis=2))
 
 
 def spread_limits(limits: LimitSet) -> LimitSet:
-    """Limits with `COPIES` rows for each of the forces', in the columns that `extend` adds."""
-    width = len(limits.of(PRESS, CONE)) * COPIES
-    wider, first = [], 0
+    """Limits with `COPIES` rows for each of the forces'."""
+    wider = []
     for limit in limits.limits:
-        forces, joints = limit.rows[:, :-4], limit.rows[:, -4:]
-        rows = np.hstack([forces, np.zeros((len(forces), width)), joints])
-        changes: dict[str, Any] = {"rows": rows}
         if limit.kind in (PRESS, CONE):
-            count, begin = len(rows) * COPIES, forces.shape[1] + first
-            changes = {"rows": np.eye(rows.shape[1])[begin : begin + count], "drags": True}
-            repeated = ("low", "high", "weight")
-            changes |= {name: np.repeat(getattr(limit, name), COPIES) for name in repeated}
-            changes["text"] = f"{limit.text} within all ranges,"
-            first += count
-        wider.append(replace(limit, **changes))
+            changes: dict[str, Any] = {"text": f"{limit.text} within all ranges,"}
+            repeated = ("rows", "low", "high", "weight")
+            changes |= {name: np.repeat(getattr(limit, name), COPIES, axis=0) for name in repeated}
+            limit = replace(limit, **changes)
+        wider.append(limit)
     return LimitSet(tuple(wider))
+
+
+def widen(limits: LimitSet, values: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
+    """Coefficients of the values of `spread_limits`, from those of limits, (n, m, 5)."""
+    forced = np.isin(np.arange(len(limits.low)), limits.of(PRESS, CONE))
+    counts = np.where(forced, COPIES, 1)
+    wide, bounds = np.repeat(values, counts, axis=1), variations[:, :, 1:]
+    copies = np.einsum("nmkp,nmpq->nmkq", signs, bounds).reshape(len(wide), -1, wide.shape[2])
+    wide[:, np.repeat(forced, counts)] -= copies
+    return wide
 
 
 def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, float]) -> RobustLimits:
@@ -156,25 +149,24 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     bare = RobustLimits(tuple(names), radii, rows, s, segment, none)
     variations = bare.find_variations(formation, point, directions, forces, epsilon)
     a, b, lam = (np.interp(s, guide.s, column) for column in guide[1:])
-    signs = _find_signs(bare, limits, forces, variations, point.z_s[:, 3:], (a, b, lam))
-    return bare._replace(signs=signs)
+    values = find_value_rows(limits, forces, point.z_s[:, 3:])
+    return bare._replace(signs=_find_signs(limits, values, variations, none, (a, b, lam)))
 
 
 def _find_signs(
-    bare: RobustLimits,
     limits: LimitSet,
-    forces: PathForces,
+    values: Array,
     variations: Array,
-    rates: Array,
+    signs: NDArray[np.int8],
     motion: tuple[Array, Array, Array],
 ) -> NDArray[np.int8]:
-    """Signs of the rows that meet at the vertices of largest and least a."""
-    wider, signs, b = spread_limits(limits), bare.signs.copy(), motion[1].copy()
-    signs[:, :, 4] = np.sign(measure(variations, motion))
-    forced = limits.only(PRESS, CONE)
+    """Signs, from none, of the rows that meet at the vertices of largest and least a."""
+    wider, signs, b = spread_limits(limits), signs.copy(), motion[1].copy()
+    bounds, copies, forced = variations[:, :, 1:], wider.of(PRESS, CONE), limits.only(PRESS, CONE)
+    signs[:, :, 4] = np.sign(apply(bounds, *motion))
     for turn in range(8):  # cutting planes
-        extended = forces._replace(of_c=bare.extend(forces.of_c, variations, signs))
-        sides = PathLimits.of(wider, extended, rates)
+        wide = widen(limits, values, variations, signs)
+        sides = PathLimits(find_slack_rows(wider, wide), np.full(len(b), np.inf))
         rows = sides.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
         ends = [sides.meet(b, sides.pair(row)) for row in extremes]
@@ -182,10 +174,10 @@ def _find_signs(
             b = np.where(ends[0][0] < ends[1][0], 0.5 * b, b)  # no polygon there
         for end, (a, lam) in enumerate(ends):
             here = np.nan_to_num(a), b, np.nan_to_num(lam)
-            slack = bare.evaluate(forces, variations, here) - forced.low
-            rowed = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
+            slack = find_least(variations, here) - forced.low
+            rowed = apply(wide[:, copies], *here).reshape(*slack.shape, -1)
             missed = slack < rowed.min(axis=2) - forced.low - 1e-9 * forced.scales  # rounding
-            better = np.sign(measure(variations, here)).astype(np.int8)
+            better = np.sign(apply(bounds, *here)).astype(np.int8)
             slots = (2 * end, 2 * end + 1) if turn == 0 else (2 * end + turn % 2,)
             for slot in slots:
                 signs[:, :, slot] = np.where(missed[..., None], better, signs[:, :, slot])
