@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ...common.arrays import Array, Expression, Flags
+from ...common.arrays import Array, Expression
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import LAMBDA, ONE, A, B, reduced_inertia
+from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
@@ -50,6 +50,7 @@ from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basi
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
+_FREE = np.array([[[-np.inf]], [[np.inf]]])  # lower and upper bounds of what has none
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
@@ -374,10 +375,8 @@ class PathIterate:
         if not result["success"]:
             raise SolverError(f"Ipopt stopped with {result['status']}")
         # b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
-        x, table = result["x"].full()[:, 0], np.zeros(nlp.free.shape)
-        table[nlp.free] = x
-        a, _, lam = (table[:, :3] * units.profile).T
-        profile = follow(self.data.grid, a, lam)
+        x = result["x"].full()[:, 0]
+        profile = follow(self.data.grid, x[nlp.x["a"]] * units.a, x[nlp.x["lam"]] * units.force)
         margin = float(x[-1]) * units.force if self.goal is Objective.MARGIN else 0.0
         return replace(
             self,
@@ -394,15 +393,14 @@ class PathIterate:
         Soft limits may be missed by somewhat more than it misses them.
         """
         nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
-        table = np.empty(nlp.free.shape)
-        table[:, nlp.node["extra"]] = self.margin / units.force
+        extra = np.full(nlp.x.sizes["extra"], self.margin / units.force)
         if self.goal is Objective.ELASTIC:
             short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
             short += 0.05 * data.limits.scales
-            table[:, nlp.node["extra"]] = short / units.of(data.limits)
-        table[:, :3] = np.column_stack(profile) / units.profile
-        table[:, nlp.node["b"]] /= data.grid.sizes[:, None]
-        return np.asarray(table[nlp.free])
+            extra = (short / units.of(data.limits)).ravel("F")
+        b = (profile.b / units.b / data.grid.sizes)[1:-1]
+        x = nlp.x.join(a=profile.a / units.a, b=b, lam=profile.lam / units.force, extra=extra)
+        return np.asarray(x)
 
     def find_parameters(self) -> Array:
         """Parameters of the NLP, in its units."""
@@ -415,8 +413,8 @@ class PathIterate:
             "calm": np.array([units.force / units.press]),
             "terms": data.nodes.values * units.motion / unit[:, None],
             "joints": torque**2 / units.power,
-            "quick": (torque / units.time / scene.torque_rate_limit)[list(shape.rates)],
-            "lags": scene.actuator_lag[list(shape.commands)] / units.time,
+            "quick": torque / units.time / scene.torque_rate_limit,
+            "lags": scene.actuator_lag / units.time,
             "maps": data.grid.maps,
             "sizes": data.grid.sizes,
         }
@@ -427,38 +425,34 @@ class PathIterate:
         nlp, data, units, tightening = self.nlp, self.data, self.units, self.tightening
         start, n = self.task.start, len(data.grid.s)
         shares = np.broadcast_to(tightening.shares, (n, 5))
-        low, high = np.full((2, n, nlp.node.count), [[[-np.inf]], [[np.inf]]])
-        # Views of the columns.
-        (low_a, low_b, low_lam), (high_a, high_b, high_lam) = low.T[:3], high.T[:3]
         # Next to rest b is 2 s times the least s''.
         s, length = data.grid.s, data.grid.s[-1]
-        low_b[:] = LEAST_B * np.minimum(s, length - s) / length
-        largest = data.largest_b(data.nodes) * shares[:, 0] / units.profile[1]
-        high_b[:] = np.maximum(largest, 2 * LEAST_B)
+        low_b = LEAST_B * np.minimum(s, length - s) / length
+        high_b = np.maximum(data.largest_b(data.nodes) * shares[:, 0] / units.b, 2 * LEAST_B)
         if data.grid.held:
-            low_b[:], high_b[:] = LEAST_B, high_b / data.grid.sizes
+            low_b, high_b = np.full(n, LEAST_B), high_b / data.grid.sizes
+        (low_a, low_lam), (high_a, high_lam) = np.full((2, 2, n), _FREE)
         # From rest to rest, without reversal.
         if nlp.shape.slow:
             low_a[[0, -1]] = high_a[[0, -1]] = 0.0
         else:
             low_a[0], high_a[-1] = LEAST_B, -LEAST_B
         if start is not None:
-            low_a[0] = max(start.least_a / units.profile[0], LEAST_B)
+            low_a[0] = max(start.least_a / units.a, LEAST_B)
             low_lam[0], high_lam[0] = start.low / units.force, start.high / units.force
         for place, pin in zip((0, -1), self.task.pins, strict=True):
             if pin is not None:
                 low_lam[place] = high_lam[place] = pin / units.force
-        low[:, nlp.node["extra"]] = -np.inf if self.goal is Objective.MARGIN else 0.0
+        least = -np.inf if self.goal is Objective.MARGIN else 0.0
+        extra = np.full((2, nlp.x.sizes["extra"]), [[least], [np.inf]])
         low_g, high_g = np.zeros((2, nlp.g.count))
         rows, signs, bounds = data.limits.sides
         unit = units.of(data.limits)
         sides = (bounds + signs * tightening.limits) / unit[rows]
-        rows_low, rows_high = np.full((2, n, nlp.g.sizes["limits"] // n), [[[-np.inf]], [[np.inf]]])
+        rows_low, rows_high = np.full((2, n, nlp.g.sizes["limits"] // n), _FREE)
         highs = rows[signs < 0] + (nlp.shape.rows if self.goal is Objective.ELASTIC else 0)
-        rows_low[:, rows[signs > 0]], rows_high[:, highs] = (
-            sides[..., signs > 0],
-            sides[..., signs < 0],
-        )
+        rows_low[:, rows[signs > 0]] = sides[..., signs > 0]
+        rows_high[:, highs] = sides[..., signs < 0]
         low_g[nlp.g["limits"]], high_g[nlp.g["limits"]] = rows_low.ravel(), rows_high.ravel()
         longest = (self.task.duration or np.inf) * tightening.late / units.time
         low_g[nlp.g["duration"]], high_g[nlp.g["duration"]] = -np.inf, longest
@@ -467,8 +461,12 @@ class PathIterate:
             within = columns[:, list(getattr(nlp.shape, name))].ravel("F")
             low_g[nlp.g[name]], high_g[nlp.g[name]] = -within, within
         low_g[nlp.g["begins"]], high_g[nlp.g["begins"]] = LEAST_B, np.inf
-        x = {"lbx": low[nlp.free], "ubx": high[nlp.free]}
-        return x | {"lbg": low_g, "ubg": high_g}
+        return {
+            "lbx": nlp.x.join(a=low_a, b=low_b[1:-1], lam=low_lam, extra=extra[0]),
+            "ubx": nlp.x.join(a=high_a, b=high_b[1:-1], lam=high_lam, extra=extra[1]),
+            "lbg": low_g,
+            "ubg": high_g,
+        }
 
     def _center(self) -> dict[str, Array]:
         """Multipliers with which a motion is near the central path: none of the links b' = 2 a.
@@ -478,18 +476,18 @@ class PathIterate:
         nlp, data, units, profile = self.nlp, self.data, self.units, self.profile
         if self.goal is Objective.ELASTIC:
             return {}
-        (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
+        rows, signs, _ = data.limits.sides
         slack = data.slack(data.nodes, profile, self.margin) / units.of(data.limits)[rows]
         on_rows = np.zeros((len(slack), nlp.shape.rows))
         for side, row in enumerate(rows.tolist()):
             on_rows[:, row] -= signs[side] * _CENTRAL / np.maximum(slack[:, side], _SLACK)
-        on_x = np.zeros(nlp.free.shape)
-        on_x[:, 1] = -_CENTRAL / np.maximum(profile.b / units.profile[1], _SLACK)
+        on_x, on_g = np.zeros(nlp.x.count), np.zeros(nlp.g.count)
+        on_x[nlp.x["b"]] = -_CENTRAL / np.maximum(profile.b[1:-1] / units.b, _SLACK)
+        on_g[nlp.g["limits"]] = on_rows.ravel()
         # The chain's multiplier at a node is the sum of those of normal forces from there on.
         chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
-        multipliers = {"chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
-        on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
-        return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
+        on_g[nlp.g["chain"]] = chain[: nlp.g.sizes["chain"]]
+        return {"lam_x0": on_x, "lam_g0": on_g}
 
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows for this motion, on other elements, or tightened."""
@@ -624,17 +622,12 @@ class PathIterate:
         on_g, count = self.multipliers["lam_g0"], len(data.grid.s)
         on_limits = on_g[nlp.g["limits"]].reshape(count, -1)
         on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
-        on_b = np.zeros(nlp.free.shape)
-        on_b[nlp.free] = self.multipliers["lam_x0"]
+        on_b = np.maximum(self.multipliers["lam_x0"][nlp.x["b"]], 0.0)
         on_shares = np.zeros((count, 5))
-        on_shares[:, 0] = np.maximum(on_b[:, 1], 0.0) * self.profile.b / data.grid.sizes
-        on_shares[:, 0] /= units.profile[1]
-        for first, name, joints in (
-            (1, "rates", nlp.shape.rates),
-            (3, "commands", nlp.shape.commands),
-        ):
-            on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
-            on_shares[:, [first + joint for joint in joints]] = on_rows
+        on_shares[1:-1, 0] = on_b * (self.profile.b / data.grid.sizes / units.b)[1:-1]
+        for first, name in ((1, "rates"), (3, "commands")):
+            columns = [first + joint for joint in getattr(nlp.shape, name)]
+            on_shares[:, columns] = np.abs(on_g[nlp.g[name]]).reshape(len(columns), count).T
         costs = (on_sides * limits).sum(axis=1) + (on_shares * shares).sum(axis=1)
         scale = abs(self.cost)
         if self.task.options.goal is Objective.MARGIN:
@@ -671,13 +664,9 @@ class LimitShape(NamedTuple):
     def of(data: PhaseData) -> LimitShape:
         """The shape of the limits of phases and of their motors."""
         limits, scene = data.limits, data.curve.formation.scene
-        return LimitShape(
-            len(limits.low),
-            tuple(limits.of(PRESS).tolist()),
-            tuple(limits.of(TORQUE).tolist()),
-            tuple(np.flatnonzero(np.isfinite(scene.torque_rate_limit)).tolist()),
-            tuple(np.flatnonzero(scene.actuator_lag).tolist()),
-        )
+        joints = np.isfinite(scene.torque_rate_limit), scene.actuator_lag
+        every = limits.of(PRESS), limits.of(TORQUE), *map(np.flatnonzero, joints)
+        return LimitShape(len(limits.low), *(tuple(each.tolist()) for each in every))
 
     @property
     def slow(self) -> tuple[int, ...]:
@@ -729,15 +718,19 @@ class Units(NamedTuple):
     press: float  # [N]: typical internal force, in the regularization
 
     @property
-    def motion(self) -> Array:
-        """Units of (1, a, b, s', internal force), shape (5,)."""
-        speed = self.length / self.time
-        return np.array([1.0, speed / self.time, speed**2, speed, self.force])
+    def a(self) -> float:
+        """Unit of s'' [m/s^2]."""
+        return self.length / self.time**2
 
     @property
-    def profile(self) -> Array:
-        """Units of a `Profile`, shape (3,)."""
-        return self.motion[[A, B, LAMBDA]]
+    def b(self) -> float:
+        """Unit of s'^2 [m^2/s^2]."""
+        return (self.length / self.time) ** 2
+
+    @property
+    def motion(self) -> Array:
+        """Units of (1, a, b, s', internal force), shape (5,)."""
+        return np.array([1.0, self.a, self.b, self.length / self.time, self.force])
 
     def of(self, limits: LimitSet) -> Array:
         """Units of each row of limits, shape (m,)."""
@@ -761,10 +754,9 @@ class PathNLP:
     solver: Expression
     starter: Expression  # for points that are no solution, with slacks near the central path
     shape: LimitShape
-    # unknowns of each node: a, b over its size (none at the two ends), internal force, and `extra`:
-    # shortfalls for `elastic`, or the least margin
-    node: Columns
-    free: Flags  # (N + 1, columns): which entries of their table are unknowns
+    # at the nodes: a, b over its size (not at the two ends), internal force `lam`, and `extra`:
+    # shortfalls for `elastic`, column by column, or the least margin
+    x: Columns
     # `lengths` of elements, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limited values at the nodes, column by column; weights of joints for
     # `effort`; for rate limits 1 / these, lags, maps of elements and `sizes` of b
@@ -783,16 +775,15 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
     soft = objective is Objective.ELASTIC
     sizes = {"lengths": n // NODES, "weight": 1, "calm": 1, "terms": 5 * n * m, "joints": 2}
-    sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
-    p = Columns(**sizes, maps=3 * n // NODES, sizes=n)
-    symbols = p.make_symbols()
-    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
-    extra = ca.SX.sym("extra", n, m if soft else int(late))
+    p = Columns(**sizes, quick=2, lags=2, maps=3 * n // NODES, sizes=n)
+    x = Columns(a=n, b=n - 2, lam=n, extra=n * (m if soft else late))
+    symbols, unknowns = p.make_symbols(), x.make_symbols()
+    a, lam, extra = unknowns.a, unknowns.lam, ca.reshape(unknowns.extra, n, -1)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
     maps, scales = ca.DM(list_maps(np.zeros(n // NODES)).T), ca.DM.ones(n)
     if slow:
         maps, scales = ca.reshape(symbols.maps, -1, 3).T, symbols.sizes
-    b = ca.vertcat(0, b_inner * scales[1:-1], 0)
+    b = ca.vertcat(0, unknowns.b * scales[1:-1], 0)
     speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
     largest = ca.fmax(scales[1:], scales[:-1])
     lengths = symbols.lengths.T
@@ -832,28 +823,21 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         "limits": ca.vec(limits.T),
         "duration": ca.sum1(times) if late else none,
     }
-    rates, slopes = dict[int, Expression](), ca.DM(find_basis().slopes)
-    for joint in slow:
-        # The derivative of the polynomials of y through the torques at the nodes.
-        table = slopes @ ca.reshape(torques[:, joint], NODES, -1)
-        rates[joint] = ca.vec(table * paces / ca.repmat(lengths, NODES, 1))
-    quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
-    lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(shape.commands)]
-    joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
-    motor_rows = {"rates": quick, "commands": lagged, "joins": joins}
-    rows |= {name: ca.vertcat(none, *expressions) for name, expressions in motor_rows.items()}
-    rows["begins"] = ca.vertcat(*find_first_slopes(a)) if slow else none
+    rows |= dict.fromkeys(("rates", "commands", "joins", "begins"), none)
+    if slow:
+        # The derivatives of the polynomials of y through the torques at the nodes.
+        slopes = ca.DM(find_basis().slopes) @ ca.reshape(torques, NODES, -1)
+        scale = ca.repmat(paces / ca.repmat(lengths, NODES, 1), 1, 2)
+        rates = ca.reshape(slopes * scale, n, 2)
+        commands = torques + rates * ca.repmat(symbols.lags.T, n, 1)
+        joins = torques[NODES::NODES, :] - torques[DEGREE:-1:NODES, :]
+        rates *= ca.repmat(symbols.quick.T, n, 1)
+        rows["rates"] = ca.vec(rates[:, list(shape.rates)])
+        rows["commands"] = ca.vec(commands[:, list(shape.commands)])
+        rows["joins"] = ca.vec(joins[:, list(slow)])
+        rows["begins"] = ca.vertcat(*find_first_slopes(a))
     g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
-    node = Columns(a=1, b=1, lam=1, extra=extra.shape[1])
-    free = np.ones((n, node.count), dtype=bool)
-    free[[0, -1], node["b"]] = False
-    every = ca.vec(ca.horzcat(a, ca.vertcat(0, b_inner, 0), lam, extra).T)
-    nlp = {
-        "x": every[np.flatnonzero(free).tolist()],
-        "p": symbols.every,
-        "f": ca.sum1(node_costs),
-        "g": g.write(**rows),
-    }
+    nlp = {"x": unknowns.every, "p": symbols.every, "f": ca.sum1(node_costs), "g": g.write(**rows)}
     book(SolverStatistics(build_time=time.perf_counter() - started))
     # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
@@ -868,7 +852,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         derived = {"jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l", "grad_f": "nlp_grad_f"}
         same = {key: solver.function.get_function(name) for key, name in derived.items()}
         starter = build_solver("path_nlp", nlp, _SLACK, same, max_iter=300, **strategy)
-    return PathNLP(solver, starter, shape, node, free, p, g)
+    return PathNLP(solver, starter, shape, x, p, g)
 
 
 # Heights of guesses over that of a fall, as powers of two: whatever the limits, and the least one
