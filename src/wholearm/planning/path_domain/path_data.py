@@ -55,7 +55,6 @@ class PhaseData(NamedTuple):
     grid: Grid
     nodes: Places  # at the nodes
     sampling: Sampling
-    knots: Places  # at the knots of every solid interval, interval by interval
     checks: Places  # at the checks of every solid interval, interval by interval
     spread: RobustLimits | None = None  # robust force limits, if there are ranges
 
@@ -72,10 +71,6 @@ class PhaseData(NamedTuple):
     def find_limits(self, places: Places) -> PathLimits:
         """The limits at places, with the internal force."""
         return PathLimits(find_slack_rows(self.limits, places.values), self.largest_b(places))
-
-    def find_tau(self, places: Places, profile: Profile) -> Array:
-        """Torques, shape (n, 2) [N m]."""
-        return apply(places.values[:, self.limits.of(TORQUE)], *profile)
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
@@ -153,7 +148,6 @@ def prepare(
     every = Places(find_value_rows(limits, forces, rates), rates, variations)
     added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
     rows = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel()
-    nodes, knots = every.pick(slice(None, len(grid.s))), every.pick(rows)
 
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
     to_checks, to_knots = (
@@ -166,19 +160,19 @@ def prepare(
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
         return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
-    checks = Places(*map(interpolate, knots))
+    nodes = every.pick(slice(None, len(grid.s)))
+    checks = Places(*map(interpolate, every.pick(rows)))
     if spread is not None:
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
-        at_nodes, at_checks = (grid.s, grid.segment), (interpolate(s[rows]), owners)
-        at_knots = s[rows], segment[rows]
-        nodes, knots, checks = (
-            each._replace(
-                values=widen(limits, each.values, each.variations, spread.pick_signs(*at))
+        at = (grid.s, grid.segment), (interpolate(s[rows]), owners)
+        nodes, checks = (
+            places._replace(
+                values=widen(limits, places.values, places.variations, spread.pick_signs(*each))
             )
-            for each, at in ((nodes, at_nodes), (knots, at_knots), (checks, at_checks))
+            for places, each in zip((nodes, checks), at, strict=True)
         )
         limits = spread_limits(limits)
-    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, knots, checks, spread)
+    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, checks, spread)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -197,7 +191,6 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     return parts[0]._replace(
         grid=Grid(*stack(grids)),
         nodes=Places(*stack(part.nodes for part in parts)),
-        knots=Places(*stack(part.knots for part in parts)),
         checks=Places(*stack(part.checks for part in parts)),
     )
 
@@ -215,22 +208,15 @@ def choose_sampling(nodes: int) -> Sampling:
 def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
     """Torque of a motion, one polynomial in time per interval.
 
-    Through the knots, or through Chebyshev points in time if that misses the torque between them.
-    SolverError if the motion all but stops in an interval.
+    Through as many checks as there are knots, or through Chebyshev points in time if that misses
+    the torque at the other checks. SolverError if the motion all but stops in an interval.
     """
-    k, (knots, checks) = data.grid.nonempty, data.sampling
-    spans = motion.durations(knots)
+    spans, count = motion.durations(data.sampling.checks), len(data.sampling.knots)
     if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
         raise SolverError("the motion all but stops between two nodes; plan with more intervals")
-    breaks = np.append(motion.times[k], motion.times[-1])
-    values = data.find_tau(data.knots, data.interpolate(motion.profile, knots))
-    torque = _fit(breaks, spans, values)
-    times = motion.times[k, None] + motion.durations(checks)
-    wanted = data.find_tau(data.checks, data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(k))
-    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    torque, misfit = _fit(data, motion.profile, spans, count)
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
+        torque = TorqueProfile.fit(torque.breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
     return torque
 
 
@@ -238,18 +224,25 @@ def find_torques(
     data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
 ) -> tuple[Array, Array]:
     """Torques and their rates, (n_solid, 2, LOOKS) [N m, N m/s], at evenly spaced times."""
-    checks, count = data.sampling.checks, len(data.grid.nonempty)
-    picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
-    places, fractions = data.checks.pick(np.tile(picked, count)), checks[picked]
-    spans = np.concatenate([motion.durations(fractions) for motion in motions])
-    values = data.find_tau(places, data.interpolate(profile, fractions))
-    torque = _fit(np.append(0.0, np.cumsum(spans[:, -1])), spans, values)
+    spans = np.concatenate([motion.durations(data.sampling.checks) for motion in motions])
+    torque, _ = _fit(data, profile, spans, PLACES)
     looks = np.linspace(-1, 1, LOOKS)
     return torque.at_places(looks), torque.slopes.at_places(looks)
 
 
-def _fit(breaks: Array, spans: Array, tau: Array) -> TorqueProfile:
-    """Polynomials in time through torques at `spans` since the breaks, (n, m) [s]."""
+def _fit(
+    data: PhaseData, profile: Profile, spans: Array, least: int
+) -> tuple[TorqueProfile, Array]:
+    """Polynomials in time through torques at `least` checks or more, and errors at all, (n, m, 2).
+
+    The checks of each interval are `spans` after its start, (n, m) [s].
+    """
+    of_tau = data.checks.values[:, data.limits.of(TORQUE)]
+    tau = apply(of_tau, *data.interpolate(profile, data.sampling.checks))
+    tau, step = tau.reshape(*spans.shape, 2), (spans.shape[1] - 1) // (least - 1)
     x = 2 * spans / spans[:, -1:] - 1
-    coefficients = np.linalg.solve(x[..., None] ** np.arange(x.shape[1]), tau.reshape(*x.shape, 2))
-    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
+    powers = x[..., None] ** np.arange(len(x[0, ::step]))
+    coefficients = np.linalg.solve(powers[:, ::step], tau[:, ::step])
+    breaks = np.append(0.0, np.cumsum(spans[:, -1]))
+    torque = TorqueProfile(breaks, np.ascontiguousarray(coefficients.transpose(0, 2, 1)))
+    return torque, powers @ coefficients - tau

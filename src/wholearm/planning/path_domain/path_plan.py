@@ -26,7 +26,7 @@ import numpy as np
 from ...common.arrays import Array, Expression
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
+from ...mechanics.dynamics import LAMBDA, ONE, A, apply, reduced_inertia
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
@@ -922,7 +922,7 @@ def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
     duration, torque = np.pi / 2 * length / np.sqrt(height), data.torque_limit
     force = max(0.5 * weight, data.epsilon, float(np.abs(profile.lam).mean()))  # the least unit
-    squares = np.minimum(np.abs(data.find_tau(data.nodes, profile)), torque) ** 2
+    squares = np.minimum(np.abs(apply(data.of_tau, *profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
     most = max(force, float(np.abs(whole).mean()))
     return profile, Units(length, 0.6 * duration, force, torque, power, most)
