@@ -26,7 +26,7 @@ import numpy as np
 from ...common.arrays import Array, Expression
 from ...common.errors import AmbiguityError, JammingError, SolverError, name_phases
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import LAMBDA, ONE, A, apply, reduced_inertia
+from ...mechanics.dynamics import LAMBDA, ONE, A, B, V, apply, reduced_inertia
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
@@ -408,7 +408,7 @@ class PathIterate:
         unit, shape, scene = units.of(data.limits), nlp.shape, data.curve.formation.scene
         torque = unit[list(shape.torques)]
         blocks = {
-            "lengths": np.diff(data.grid.edges) / units.length,
+            "steps": data.grid.steps / units.length,
             "weight": np.array([self.task.options.time_weight / units.power]),
             "calm": np.array([units.force / units.press]),
             "terms": data.nodes.values * units.motion / unit[:, None],
@@ -448,11 +448,11 @@ class PathIterate:
         low_g, high_g = np.zeros((2, nlp.g.count))
         rows, signs, bounds = data.limits.sides
         unit = units.of(data.limits)
-        sides = (bounds + signs * tightening.limits) / unit[rows]
+        sides = (bounds + signs * tightening.limits - data.nodes.values[:, rows, ONE]) / unit[rows]
         rows_low, rows_high = np.full((2, n, nlp.g.sizes["limits"] // n), _FREE)
         highs = rows[signs < 0] + (nlp.shape.rows if self.goal is Objective.ELASTIC else 0)
-        rows_low[:, rows[signs > 0]] = sides[..., signs > 0]
-        rows_high[:, highs] = sides[..., signs < 0]
+        rows_low[:, rows[signs > 0]] = sides[:, signs > 0]
+        rows_high[:, highs] = sides[:, signs < 0]
         low_g[nlp.g["limits"]], high_g[nlp.g["limits"]] = rows_low.ravel(), rows_high.ravel()
         longest = (self.task.duration or np.inf) * tightening.late / units.time
         low_g[nlp.g["duration"]], high_g[nlp.g["duration"]] = -np.inf, longest
@@ -757,7 +757,7 @@ class PathNLP:
     # at the nodes: a, b over its size (not at the two ends), internal force `lam`, and `extra`:
     # shortfalls for `elastic`, column by column, or the least margin
     x: Columns
-    # `lengths` of elements, `weight` of time, unit of internal force in the regularization;
+    # `steps` between nodes, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limited values at the nodes, column by column; weights of joints for
     # `effort`; for rate limits 1 / these, lags, maps of elements and `sizes` of b
     p: Columns
@@ -771,10 +771,9 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     """Build the NLP for every phase with limits of a shape."""
     started = time.perf_counter()
     n, m, slow = intervals + 1, shape.rows, shape.slow
-    weights = find_basis().weights
     effort, late = objective is Objective.EFFORT, objective is Objective.MARGIN
     soft = objective is Objective.ELASTIC
-    sizes = {"lengths": n // NODES, "weight": 1, "calm": 1, "terms": 5 * n * m, "joints": 2}
+    sizes = {"steps": intervals, "weight": 1, "calm": 1, "terms": 5 * n * m, "joints": 2}
     p = Columns(**sizes, quick=2, lags=2, maps=3 * n // NODES, sizes=n)
     x = Columns(a=n, b=n - 2, lam=n, extra=n * (m if soft else late))
     symbols, unknowns = p.make_symbols(), x.make_symbols()
@@ -786,14 +785,17 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     b = ca.vertcat(0, unknowns.b * scales[1:-1], 0)
     speed = ca.vertcat(0, ca.sqrt(b[1:-1]), 0)
     largest = ca.fmax(scales[1:], scales[:-1])
-    lengths = symbols.lengths.T
-    paces, spans = _find_paces(a, speed, lengths, maps, bool(slow)), ca.DM(weights) @ lengths
-    times = ca.vec(spans / paces)
-    motion = dict(enumerate((ca.SX.ones(n), a, b, speed, lam)))
+    h = symbols.steps
+    lengths = ca.sum1(ca.reshape(ca.vertcat(h, 0), NODES, -1))
+    paces = _find_paces(a, speed, lengths, maps, bool(slow))
+    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
+    # Limits but for their constant part, which is in the bounds.
+    motion = {A: a, B: b, V: speed, LAMBDA: lam}
     terms = ca.horzsplit(ca.reshape(symbols.terms, n, -1), m)
-    values = sum(table * ca.repmat(motion[k], 1, m) for k, table in enumerate(terms))
-    torques, scaled_lam = values[:, list(shape.torques)], symbols.calm * lam
-    node_costs = 2e-6 * ca.vec(spans) * scaled_lam**2  # among equal plans
+    values = sum(terms[k] * ca.repmat(column, 1, m) for k, column in motion.items())
+    torques, scaled_lam = (values + terms[ONE])[:, list(shape.torques)], symbols.calm * lam
+    node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
     rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if soft:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
