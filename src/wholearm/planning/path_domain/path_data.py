@@ -1,7 +1,7 @@
 """Inverse dynamics and limits along the curves of phases, at nodes and between them.
 
-Coefficients of forces are evaluated at the nodes and at a few knots of every interval. Polynomials
-through the knots give them where limits are checked.
+Coefficients of the limited values are evaluated at the nodes and at a few knots of every interval.
+Polynomials through the knots give them where limits are checked.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ LOOKS = 21  # samples of torque rates in each interval
 
 
 class Sampling(NamedTuple):
-    """Knots of forces and places of checks in an interval, from 0 to 1, its ends included."""
+    """Knots of coefficients and places of checks in an interval, from 0 to 1, with both ends."""
 
     knots: Array
     checks: Array
 
 
 class Places(NamedTuple):
-    """Inverse dynamics at n places of a curve."""
+    """What limits at n places of a curve follow from."""
 
     values: Array  # (n, m, 5): coefficients of the limited values, of (1, s'', s'^2, s', lambda)
     rates: Array  # (n, 2): d theta / ds

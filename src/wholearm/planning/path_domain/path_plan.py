@@ -50,7 +50,6 @@ from .path_motion import DEGREE, NODES, Elements, PathMotion, Profile, find_basi
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
-_FREE = np.array([[[-np.inf]], [[np.inf]]])  # lower and upper bounds of what has none
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
@@ -431,7 +430,12 @@ class PathIterate:
         high_b = np.maximum(data.largest_b(data.nodes) * shares[:, 0] / units.b, 2 * LEAST_B)
         if data.grid.held:
             low_b, high_b = np.full(n, LEAST_B), high_b / data.grid.sizes
-        (low_a, low_lam), (high_a, high_lam) = np.full((2, 2, n), _FREE)
+        low, high = np.full((2, nlp.x.count), [[-np.inf], [np.inf]])
+        low[nlp.x["b"]], high[nlp.x["b"]] = low_b[1:-1], high_b[1:-1]
+        low[nlp.x["extra"]] = -np.inf if self.goal is Objective.MARGIN else 0.0
+        (low_a, high_a), (low_lam, high_lam) = (
+            (low[nlp.x[name]], high[nlp.x[name]]) for name in ("a", "lam")
+        )
         # From rest to rest, without reversal.
         if nlp.shape.slow:
             low_a[[0, -1]] = high_a[[0, -1]] = 0.0
@@ -443,17 +447,13 @@ class PathIterate:
         for place, pin in zip((0, -1), self.task.pins, strict=True):
             if pin is not None:
                 low_lam[place] = high_lam[place] = pin / units.force
-        least = -np.inf if self.goal is Objective.MARGIN else 0.0
-        extra = np.full((2, nlp.x.sizes["extra"]), [[least], [np.inf]])
         low_g, high_g = np.zeros((2, nlp.g.count))
-        rows, signs, bounds = data.limits.sides
-        unit = units.of(data.limits)
+        (rows, signs, bounds), unit = data.limits.sides, units.of(data.limits)
         sides = (bounds + signs * tightening.limits - data.nodes.values[:, rows, ONE]) / unit[rows]
-        rows_low, rows_high = np.full((2, n, nlp.g.sizes["limits"] // n), _FREE)
+        low_g[nlp.g["limits"]], high_g[nlp.g["limits"]] = -np.inf, np.inf
         highs = rows[signs < 0] + (nlp.shape.rows if self.goal is Objective.ELASTIC else 0)
-        rows_low[:, rows[signs > 0]] = sides[:, signs > 0]
-        rows_high[:, highs] = sides[:, signs < 0]
-        low_g[nlp.g["limits"]], high_g[nlp.g["limits"]] = rows_low.ravel(), rows_high.ravel()
+        low_g[nlp.g["limits"]].reshape(n, -1)[:, rows[signs > 0]] = sides[:, signs > 0]
+        high_g[nlp.g["limits"]].reshape(n, -1)[:, highs] = sides[:, signs < 0]
         longest = (self.task.duration or np.inf) * tightening.late / units.time
         low_g[nlp.g["duration"]], high_g[nlp.g["duration"]] = -np.inf, longest
         most = data.torque_limit / unit[list(nlp.shape.torques)]
@@ -461,12 +461,7 @@ class PathIterate:
             within = columns[:, list(getattr(nlp.shape, name))].ravel("F")
             low_g[nlp.g[name]], high_g[nlp.g[name]] = -within, within
         low_g[nlp.g["begins"]], high_g[nlp.g["begins"]] = LEAST_B, np.inf
-        return {
-            "lbx": nlp.x.join(a=low_a, b=low_b[1:-1], lam=low_lam, extra=extra[0]),
-            "ubx": nlp.x.join(a=high_a, b=high_b[1:-1], lam=high_lam, extra=extra[1]),
-            "lbg": low_g,
-            "ubg": high_g,
-        }
+        return {"lbx": low, "ubx": high, "lbg": low_g, "ubg": high_g}
 
     def _center(self) -> dict[str, Array]:
         """Multipliers with which a motion is near the central path: none of the links b' = 2 a.
@@ -758,8 +753,9 @@ class PathNLP:
     # shortfalls for `elastic`, column by column, or the least margin
     x: Columns
     # `steps` between nodes, `weight` of time, unit of internal force in the regularization;
-    # coefficients of the limited values at the nodes, column by column; weights of joints for
-    # `effort`; for rate limits 1 / these, lags, maps of elements and `sizes` of b
+    # coefficients of the limited values at the nodes, column by column (constant ones are part of
+    # the bounds, too); weights of joints for `effort`; for rate limits 1 / these, lags, maps of
+    # elements and `sizes` of b
     p: Columns
     # b' = 2 a; the `chain` of the margin; node by node the `limits`, where they are soft the lower
     # ones, then the upper ones; the `duration` for `margin`; rate limits
