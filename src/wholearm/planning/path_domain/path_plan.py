@@ -652,6 +652,7 @@ class LimitShape(NamedTuple):
     rows: int  # number m of rows
     presses: tuple[int, ...]  # rows of the least normal forces
     torques: tuple[int, ...]  # rows of the torques
+    fast: tuple[int, ...]  # rows that depend on s'
     rates: tuple[int, ...]  # joints with a torque rate limit
     commands: tuple[int, ...]  # joints whose torques lag behind a command
 
@@ -659,8 +660,10 @@ class LimitShape(NamedTuple):
     def of(data: PhaseData) -> LimitShape:
         """The shape of the limits of phases and of their motors."""
         limits, scene = data.limits, data.curve.formation.scene
-        joints = np.isfinite(scene.torque_rate_limit), scene.actuator_lag
-        every = limits.of(PRESS), limits.of(TORQUE), *map(np.flatnonzero, joints)
+        # What depends on torques or speeds of the joints does so with viscous friction.
+        fast = limits.rows[:, -4:].any(axis=1) | data.nodes.values[..., V].any(axis=0)
+        flags = fast, np.isfinite(scene.torque_rate_limit), scene.actuator_lag
+        every = limits.of(PRESS), limits.of(TORQUE), *map(np.flatnonzero, flags)
         return LimitShape(len(limits.low), *(tuple(each.tolist()) for each in every))
 
     @property
@@ -786,9 +789,9 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     paces = _find_paces(a, speed, lengths, maps, bool(slow))
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
     # Limits but for their constant part, which is in the bounds.
-    motion = {A: a, B: b, V: speed, LAMBDA: lam}
-    terms = ca.horzsplit(ca.reshape(symbols.terms, n, -1), m)
-    values = sum(terms[k] * ca.repmat(column, 1, m) for k, column in motion.items())
+    terms, fast = ca.horzsplit(ca.reshape(symbols.terms, n, -1), m), list(shape.fast)
+    values = sum(terms[k] * ca.repmat(each, 1, m) for k, each in ((A, a), (B, b), (LAMBDA, lam)))
+    values[:, fast] += terms[V][:, fast] * ca.repmat(speed, 1, len(fast))
     torques, scaled_lam = (values + terms[ONE])[:, list(shape.torques)], symbols.calm * lam
     node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
     node_costs = 1e-6 * node_weights * scaled_lam**2  # among equal plans
