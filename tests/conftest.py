@@ -61,7 +61,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> None:
 def quiet() -> Iterator[None]:
     """No line of progress on stderr, however long a command takes on this machine."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wholearm.cli.command.EVERY", math.inf)
+        patch.setattr("wholearm.cli.command.LOG_INTERVAL", math.inf)
         yield
 
 

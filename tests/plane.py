@@ -17,7 +17,7 @@ from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.curve import Curve
 from wholearm.results.trajectory import Samples
-from wholearm.verification.newton_euler import Touch, locate
+from wholearm.verification.newton_euler import ContactGeometry, locate
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 
@@ -132,7 +132,7 @@ def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
     )
 
 
-def locate_all(formation: Formation, z: Array) -> list[Touch]:
+def locate_all(formation: Formation, z: Array) -> list[ContactGeometry]:
     """The contacts of a formation at configurations, shape (..., 5)."""
     return [locate(formation.scene, name, z.reshape(-1, 5)) for name in formation.names]
 

@@ -22,7 +22,7 @@ from wholearm import Scene
 from wholearm.benchmark.refusals import Bounds, constrain, maximise
 from wholearm.common.arrays import Array
 from wholearm.problem.definition import Phase
-from wholearm.verification.newton_euler import Touch, locate
+from wholearm.verification.newton_euler import ContactGeometry, locate
 
 STILL = 1e-9  # rate over the largest one below which something stands still
 
@@ -54,7 +54,7 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
     return max(margins)
 
 
-def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
+def list_others(scene: Scene, phase: Phase, z: Array) -> list[ContactGeometry]:
     """Contacts that touch at `z` but are none of the phase's: they may only open."""
     near, count = 1e-6 * scene.scales.length, len(scene.polygon.vertices)
     names = [f"v{k}-{part}" for k, part in product(range(count), ("palm", "finger1", "finger2"))]
@@ -79,7 +79,7 @@ def _ways(slip: Array) -> Iterator[Array]:
 def _solve_at_rest(
     scene: Scene,
     epsilon: float,
-    touches: list[Touch],
+    touches: list[ContactGeometry],
     N: Array,
     rates: tuple[Array, Array, Array],
     ends: bool,

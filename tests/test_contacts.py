@@ -328,7 +328,7 @@ def test_known_contacts_are_where_closing_fingers_come_to_touch(
 def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     scene, labels, poses, _ = close(0.01)
     ways = np.random.default_rng(4).normal(size=poses.shape) * [0.03, 1.0]
-    z, z_u, z_uu, _ = closing.move(scene, labels, poses, ways)
+    z, z_u, z_uu, _ = closing.evaluate_path(scene, labels, poses, ways)
     # Steps with errors of truncation and rounding below the tolerances.
     (left, right), (before, after) = (
         [closing.place_at(scene, labels, poses + side * step * ways) for side in (-1, 1)]

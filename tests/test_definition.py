@@ -26,7 +26,7 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
 from wholearm.common.fields import key as declare_key
-from wholearm.common.parallel import share
+from wholearm.common.parallel import run_tasks
 from wholearm.geometry.path_guess import find_end
 from wholearm.geometry.tracing import check_phases, trace_phase, trace_phases
 from wholearm.mapping.formation_list import write_template
@@ -429,7 +429,7 @@ def test_what_only_objects_can_say_wrongly() -> None:
         (lambda: public.place_start(given.scene, -1, 0.0), "start.flush: -1 is not an edge"),
         (lambda: public.list_formations(given, (0.1,), (0.2, 0.0)), "is not a list of 2 numbers"),
         (lambda: public.write_mjcf(given, step=math.nan), "step: nan is not a positive number"),
-        (lambda: share([], jobs=-1), "jobs: -1 given; allowed are whole numbers from 1 to 256"),
+        (lambda: run_tasks([], jobs=-1), "jobs: -1 given; allowed are whole numbers from 1 to 256"),
     ):
         with pytest.raises(InputError, match=text):
             call()

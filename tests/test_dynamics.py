@@ -30,13 +30,13 @@ from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.blocks import ImpactSequence
 from wholearm.planning.path_domain.path_plan import Task, plan_curves
-from wholearm.planning.time_domain.stage import in_own_units, unit_lengths
+from wholearm.planning.time_domain.stage import in_scene_units, unit_lengths
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation import complementarity
-from wholearm.verification.verify import find_uniqueness_margin, find_wedged, reduce_to_first_joint
+from wholearm.verification.verify import find_stuck, find_uniqueness_margin, reduce_to_first_joint
 
 State = tuple[Formation, Array, Array, Directions]
 """A formation, a configuration and a velocity that keep its contacts, and the signs of sliding."""
@@ -222,16 +222,16 @@ def test_each_body_takes_its_impulses_as_complementarity_says() -> None:
                 assert (parting > 0.1).all()
             else:
                 # What would have to pull is let go.
-                assert rates[after.names.index(impact.least[0])] > 0.01
+                assert rates[after.names.index(impact.least_impulse[0])] > 0.01
                 assert not np.allclose(collision.v, impact.v, atol=0.1)
 
 
 def test_what_would_have_to_pull_is_named() -> None:
     tipping = chain_of(HEPTAGON)
     impact = tipping.impacts[0].impact
-    assert impact.least == ("v1-palm", float(impact.p[1]))
+    assert impact.least_impulse == ("v1-palm", float(impact.p[1]))
     first = impact.violations[0]
-    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least)
+    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least_impulse)
     assert tipping.impacts[0].reason == "impulse on v1-palm would be -0.0414 N s per m/s"
     assert first.describe() == "impulse on v1-palm would be -0.0414 N s"
 
@@ -289,7 +289,7 @@ def test_a_corner_dropped_on_the_palm(friction: float, slide: float) -> None:
     fall = v[1] + r[0] * v[2]
     p = -fall / (1 / MASS + r[0] * (r[0] + friction * way * r[1]) / inertia)
     assert p > 0 and impact.possible
-    assert impact.least[0] == "v1-palm" and impact.least[1] == pytest.approx(p)
+    assert impact.least_impulse[0] == "v1-palm" and impact.least_impulse[1] == pytest.approx(p)
     spin = v[2] + (r[0] * p + r[1] * friction * way * p) / inertia
     expected = [v[0] - friction * way * p / MASS, v[1] + p / MASS, spin, 0.0, 0.0]
     np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)
@@ -562,7 +562,7 @@ def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
     first = first / 2
     halves = (first + last) / 2, (last - first) / 2
     torque = TorqueProfile(plan.t[rows[[0, -1]]], np.stack(halves, axis=-1)[None])
-    wedged = find_wedged(problem, phase, replace(plan, torque=torque), 1e-9)
+    wedged = find_stuck(problem, phase, replace(plan, torque=torque), 1e-9)
     assert wedged is not None and 0 < wedged < duration
     for share, held in ((0.0, True), (0.97, True), (1.03, False)):
         tau = first + share * wedged / duration * (last - first)
@@ -618,7 +618,7 @@ def test_planner_and_linear_programme_agree_on_what_rests(phase: int, ends: bool
     z = curve.end if ends else curve.evaluate(np.zeros(1)).z[0]
     cell, scene = problem.phases[phase], problem.scene
     low, high = 0.0, 200.0
-    own, scaled = in_own_units(problem), z / unit_lengths(problem.scene.scales)
+    own, scaled = in_scene_units(problem), z / unit_lengths(problem.scene.scales)
     while high - low > 1e-3:
         middle = (low + high) / 2
         held = Statics(own.phases[phase].formation, scaled).find_block(middle, ends)

@@ -365,10 +365,10 @@ def test_a_plan_is_known_between_the_rows_of_its_file(tmp_path: Path) -> None:
     plan = plan_of(HEPTAGON)
     plan.save(tmp_path / "plan.npz")
     loaded = load_trajectory(tmp_path / "plan.npz")
-    found, t = engine_replay.find_between(loaded), np.linspace(0.0, plan.duration - 1e-9, 2001)
+    found, t = engine_replay.find_reference(loaded), np.linspace(0.0, plan.duration - 1e-9, 2001)
     off = [np.nanmean(np.abs(own.at(t).c_n - plan.at(t).c_n)) for own in (found, loaded)]
     assert off[0] < 0.1 * off[1]
     # What does not replay as planned is taken as it is.
     weaker = replace(loaded.torque, coefficients=0.9 * loaded.torque.coefficients)
     wrong = replace(loaded, torque=weaker)
-    assert engine_replay.find_between(wrong) is wrong
+    assert engine_replay.find_reference(wrong) is wrong

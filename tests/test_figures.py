@@ -49,8 +49,8 @@ from wholearm.planning.result import Plan, Status, describe_plan, load_plan, wri
 from wholearm.results.dwell_record import assemble
 from wholearm.verification.newton_euler import balance, locate
 from wholearm.viewer.movie import FRAMES, write_movie
-from wholearm.viewer.page import build_page, describe_motion, write_chart, write_player
-from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
+from wholearm.viewer.page import build_page, describe_motion, write_map, write_player
+from wholearm.viewer.report_page import build_report, describe_map, list_junctions, list_phases
 
 
 @pytest.fixture(scope="module")
@@ -476,7 +476,7 @@ def test_a_motion_survives_its_page() -> None:
 
 def test_tables_say_what_the_joints_of_phases_are() -> None:
     problem, plan, replay = problem_of(LANDING), plan_of(LANDING), verified(LANDING).trajectory
-    phases, joints = list_phases(problem, plan), list_joints(plan)
+    phases, joints = list_phases(problem, plan), list_junctions(plan)
     for table, count in ((phases, 6), (joints, 5)):
         assert {len(row) for row in table.rows} == {len(table.columns)}
         assert [row[0] for row in table.cells] == list("123456"[:count])
@@ -487,7 +487,7 @@ def test_tables_say_what_the_joints_of_phases_are() -> None:
     assert speeds[3] == 2 * ["0.0000"] and speeds[4][0] == speeds[4][1] != "0.0000"
     assert "v3-finger1: 0.050 \u2192 -" in joints.cells[4][1]
     # One contact opens at each, in the replay, too.
-    assert [row[1].count("\u2192 -") for row in list_joints(replay).cells] == 5 * [1]
+    assert [row[1].count("\u2192 -") for row in list_junctions(replay).cells] == 5 * [1]
 
 
 def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
@@ -548,7 +548,7 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
     texts = [place["text"] for place in places]
     firsts = [next(k for k, text in enumerate(texts) if text.startswith(kind)) for kind in kinds]
     motion = describe_motion(plan, problem, plan) | {"speed": 0.25}
-    parts = [write_player(motion), write_chart(drawing, told)]
+    parts = [write_player(motion), write_map(drawing, told)]
     acts = """<script>
       const said = {}, output = document.querySelector("output");
       const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
@@ -722,7 +722,7 @@ def test_html_has_the_same_cells_and_names_escaped() -> None:
 
 
 def test_long_tables_are_cut_as_text_and_have_a_rule_as_markdown() -> None:
-    table = Table(["n:d", "a:b:.1f", "word"], [(k, k / 2, "w") for k in range(5)], most=2)
+    table = Table(["n:d", "a:b:.1f", "word"], [(k, k / 2, "w") for k in range(5)], max_rows=2)
     text = table.to_text().splitlines()
     assert text[0].split() == ["n", "a:b", "word"] and len(text) == 4
     assert text[-1] == "... and 3 more, see --json"

@@ -90,12 +90,12 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
                 words = {1: "too short", 2: "inside the object"}[obstacle]
                 with pytest.raises(InputError, match=words):
                     close_finger(scene, closed.z[row, :3], finger)
-                assert np.isnan(angle) and closed.touched[row, finger] == -1
+                assert np.isnan(angle) and closed.contacts[row, finger] == -1
                 continue
             assert close_finger(scene, closed.z[row, :3], finger) == pytest.approx(angle, abs=1e-12)
             # asin and acos lose half the digits where a vertex is at the joint or the reach ends.
             assert plane.is_first_touch(scene, closed.z[row, :3], finger, angle, 1e-9, 300)
-            contact = contact_table(scene)[closed.touched[row, finger]]
+            contact = contact_table(scene)[closed.contacts[row, finger]]
             assert contact.finger == finger
             assert abs(gaps(scene, [contact], closed.z[[row]])[0, 0]) < 1e-9
     assert seen == {0, 1, 2}
@@ -115,7 +115,7 @@ def test_closing_on_many_vertices_finds_the_first_of_them(radius: float) -> None
         for row, finger in np.argwhere(closed.obstacle == 0):
             z = closed.z[row]
             assert plane.is_first_touch(scene, z[:3], finger, z[3 + finger], 1e-9, 300)
-            contact = contact_table(scene)[closed.touched[row, finger]]
+            contact = contact_table(scene)[closed.contacts[row, finger]]
             assert abs(gaps(scene, [contact], z[None])[0, 0]) < 1e-9
             seen.add((contact.feature, contact.surface))
     assert seen >= {("v", "finger"), ("e", "tip")}
@@ -578,7 +578,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
     until = [str(phase.until) for phase in phases]
     place = make_place(problem.scene, problem.start)
-    edges = chart.list_along(place, FAR_GOAL)
+    edges = chart.collect_edges(place, FAR_GOAL)
     (own,) = (edge for edge in edges if [str(step.until) for step in edge.steps] == until)
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
     took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
@@ -600,7 +600,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
 
 def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     problem = problem_of(HEPTAGON)
-    edges = Roadmap(problem, 0.1).list_along(make_place(problem.scene, problem.start), FAR_GOAL)
+    edges = Roadmap(problem, 0.1).collect_edges(make_place(problem.scene, problem.start), FAR_GOAL)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
     assert not any(len(own.steps) > 1 and str(own.steps[0].until) == "v3-finger1" for own in edges)
 

@@ -27,7 +27,7 @@ from wholearm.mapping.formation_list import write_template
 from wholearm.mechanics.dynamics import Directions, forward
 from wholearm.mechanics.limits import force_limit_rows
 from wholearm.policy import curve_law, make, regulator
-from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, choose_internal_force
+from wholearm.policy.curve_law import CurveLaw, LoopSettings, TimeLaw, choose_internal_force
 from wholearm.policy.regulator import DAMPING, RATE, Linear, hold_end, regulate, tabulate_motion
 from wholearm.problem.definition import End
 from wholearm.problem.read import build_problem
@@ -85,7 +85,7 @@ def test_limits_that_the_squeeze_does_not_change_leave_it_where_it_is(policy: Po
     for rounding in (0.0, 5e-15, -2e-17):
         tables["levels"] = policy.tables[0]["levels"].copy()
         tables["levels"][0, 0, 0, 4] = rounding
-        levels.append(CurveLaw(tables, policy.settings).levels)
+        levels.append(CurveLaw(tables, policy.settings).slack)
     assert levels[0] == levels[1] == levels[2]
 
 
@@ -220,20 +220,20 @@ def test_a_landing_goes_on_until_its_contact_stops_the_joints(approach: float) -
         "still": np.array([0.02]), "ways": np.array([[0.0, 1.0]]),
         "approach": np.array([approach, 0.0]),
     }  # fmt: skip
-    law = MotionLaw(tables, settings)
+    law = TimeLaw(tables, settings)
     angle, ends = np.zeros(2), 0.012  # the contact is 2 mrad beyond the end
     for step in range(200):
         beyond = min(max(1e-3 * (step - 10), 0.0) * 0.1, ends - 0.01)
         angle[:] = 0.01 * min(step / 10, 1.0) + beyond, 0.0
         speed = 0.1 if angle[0] < ends - 1e-9 else 0.0
         torques = law.step(angle.tolist(), [speed, 0.0], None)
-        if law.over:
+        if law.finished:
             break
-        assert law.pushes <= (angle[0] > ends - 1e-9)
+        assert law.contact_made <= (angle[0] > ends - 1e-9)
         if not approach and 12 < step < 28:
             assert torques == pytest.approx((0.5 - speed, 0.5))
     # It is held with the torques that press, without a spring across what the contact leaves free.
-    assert law.pushes and step < 80 and torques == pytest.approx((0.5, 0.5))
+    assert law.contact_made and step < 80 and torques == pytest.approx((0.5, 0.5))
 
 
 def test_a_contact_presses_under_the_name_of_the_neighbour_that_it_goes_on_from() -> None:
@@ -273,7 +273,7 @@ def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
         z, chord = plan.z[row], np.array(law.chords[k]) / law.steps[k]
         v = plan.z_dot[row] * speed * np.linalg.norm(chord) / np.linalg.norm(plan.z_dot[row, 3:])
         a = (law.b[k] - law.b[k - 1]) / (2 * law.steps[k - 1])
-        tables = law.levels[k - 1], law.torque[k - 1]
+        tables = law.slack[k - 1], law.torque[k - 1]
         levels, torques = (curve_law._evaluate(table, 1.0, speed) for table in tables)
         tau = np.array(torques) @ [1.0, a, curve_law._choose_at(levels, a)[1]]
         at = phase.formation.evaluate(z[None], v[None])
@@ -425,16 +425,16 @@ def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:
         assert tables[1][name] == pytest.approx(array, abs=5e-3 * np.abs(array).max()), name
     policy = make.make_policy(problem, plan, planner=planner)
     law = policy.laws[-1]
-    assert isinstance(law, MotionLaw)
+    assert isinstance(law, TimeLaw)
     # The plan's torques are at their limit, the policy's leave some of it to feedback.
     assert np.abs(plan.tau).max() == pytest.approx(2.0, rel=1e-6)
     assert np.abs(law.tau).max() < 1.85
     # It ends where the plan does: the new landing is pinned to the plan's.
-    assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=regulator.SAME)
+    assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=regulator.END_TOLERANCE)
     # What friction holds a little beside it is held with the same torques ever after.
     law.begin(at_end=True)
     held = [law.step([one + 1e-4 for one in law.theta[-1]], [0.0, 0.0], None) for _ in range(900)]
-    assert law.over and held[-1] == held[100]
+    assert law.finished and held[-1] == held[100]
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
 
@@ -459,7 +459,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     widths |= {"mass": 0.1, "inertia": 0.1}
     curve = trace_phase(ranged.phases[0], ranged.start, ())
     s = curve.length * np.array([0.1, 0.2, 0.3])
-    within = make.find_within(curve, s, np.zeros(3), widths, ranged.epsilon)
+    within = make.find_range_limits(curve, s, np.zeros(3), widths, ranged.epsilon)
     a, b, squeeze = np.array([3.0, 0.0, -4.0]), np.array([0.1, 0.2, 0.1]), np.full(3, 2.0)
     known = np.column_stack([np.ones(3), a, b, np.sqrt(b), squeeze])
     tau = np.einsum("nfq,nq->nf", within.torque, known)
@@ -474,8 +474,8 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
         at = formation.evaluate(point.z, z_dot)
         least = np.minimum(least, forward(formation, at, z_dot, tau, directions)[1])
     rows, _, _ = within.at((a, b, squeeze))
-    unit = max(make.SETTINGS.least * ranged.scene.scales.force, ranged.epsilon)
-    found = unit * np.einsum("nmq,nq->nm", rows.levels[:, : rows.presses], known).reshape(3, -1, 4)
+    unit = max(make.SETTINGS.force_margin * ranged.scene.scales.force, ranged.epsilon)
+    found = unit * np.einsum("nmq,nq->nm", rows.slack[:, : rows.n_force], known).reshape(3, -1, 4)
     assert found[:, 0] == pytest.approx(least, abs=1e-9)
     # Other rows are of corners that are worst at other squeezes.
     assert (found > least[:, None] - 1e-9).all()
@@ -497,11 +497,11 @@ def test_ranges_too_wide_are_kept_in_part(ranged: Problem, ranged_plan: Trajecto
     s = np.linspace(0.0, curve.length, 11)
     b = 0.05 * (4 * s * (curve.length - s) / curve.length**2)
     motion = np.gradient(b, s) / 2, b, np.ones(11)
-    found, share = make.retime_within(curve, s, motion, {"mass": 0.5, "friction_palm": 1.0}, 0.2)
+    found, share = make.retime_in_ranges(curve, s, motion, {"mass": 0.5, "friction_palm": 1.0}, 0.2)
     assert 0.0 < share < 1.0 and found is not None
     assert (found[1].run(0.0) <= b + 1e-12).all()
     with pytest.raises(InputError, match="uncertainty: is missing"):
-        make.find_widest(replace(ranged, uncertainty=None), ranged_plan, 0.0)
+        make.find_largest_factors(replace(ranged, uncertainty=None), ranged_plan, 0.0)
 
 
 def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
@@ -510,8 +510,8 @@ def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
     known = np.array([1.0, 1.0, 0.1, np.sqrt(0.1), 2.0])
 
     def measure(widths: dict[str, float]) -> np.ndarray:
-        rows, _, _ = make.find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)
-        return np.asarray(rows.levels[0, :4] @ known)
+        rows, _, _ = make.find_range_limits(curve, s, np.zeros(1), widths, 0.05).at(motion)
+        return np.asarray(rows.slack[0, :4] @ known)
 
     # Forces are affine in torques: what a gain takes away is in proportion to it.
     exact, off = measure({}), measure({"gain1": 0.02})

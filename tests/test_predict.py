@@ -102,7 +102,7 @@ def test_forces_under_torques_are_those_of_inverse_dynamics() -> None:
     for road in (road_of(HEPTAGON), road_of(BOX, 1)):
         a, squeeze = np.sin(road.s), np.cos(road.s)
         b = np.full(len(road.s), 0.04)
-        c = road.press_under(road.forces.tau(a, b, squeeze), 0.2)
+        c = road.find_forces(road.forces.tau(a, b, squeeze), 0.2)
         assert c == pytest.approx(road.forces.c(a, b, squeeze), abs=1e-9)
 
 
@@ -114,7 +114,7 @@ def test_quasistatic_torques_balance_and_are_the_least() -> None:
         assert torques is not None
         wanted = 0.05 + share * (most - 0.05)
         assert (torques.c_n.min(axis=1) >= wanted - 1e-9).all()
-        assert torques.c_n == pytest.approx(road.press_under(torques.tau, 0.0), abs=1e-9)
+        assert torques.c_n == pytest.approx(road.find_forces(torques.tau, 0.0), abs=1e-9)
         low, high = road.force_limits.find_span(still, still, wanted)
         for part in (0.1, 0.9):
             other = road.forces.tau(still, still, low + part * (high - low))
@@ -191,7 +191,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     printed = predicted().to_text()
     for survival in own.survivals:
         assert f"{survival.motion}" in printed and survival.first.name in printed
-    assert slow_speeds.OWN in printed and "all along" in printed
+    assert slow_speeds.OWN_TORQUES in printed and "all along" in printed
     # Forces that are known from some speed on alone are drawn.
     late = slow_speeds.Curves(np.array([0.1, 0.2, 0.3]), {"steady": np.array([-np.inf, 5, 6])})
     phases = (dataclasses.replace(own, curves=late, survivals=own.survivals[:1]),)

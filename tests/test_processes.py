@@ -32,7 +32,7 @@ from tiny_study import die_once
 from wholearm.common import files as archive
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
-from wholearm.common.parallel import Processes, can_fork, count_cores, run_all, share
+from wholearm.common.parallel import Processes, can_fork, count_cores, run_all, run_tasks
 from wholearm.planning.nlp import STOPPED, Solver
 from wholearm.simulation.simulate import simulate
 
@@ -66,7 +66,7 @@ def fail() -> None:
 @needs_fork
 def test_tasks_are_done_by_two_processes_at_the_same_time() -> None:
     assert can_fork() and count_cores() >= 1
-    one, other = share([Meeting()] * 2, 2)
+    one, other = run_tasks([Meeting()] * 2, 2)
     assert PARENT in (one, other) and one != other and not multiprocessing.active_children()
 
 
@@ -77,14 +77,14 @@ def test_results_are_in_order() -> None:
     def task(k: int) -> Callable[[], object]:
         return lambda: meet() and k
 
-    assert share([task(k) for k in range(1, 5)], 2) == [1, 2, 3, 4]
+    assert run_tasks([task(k) for k in range(1, 5)], 2) == [1, 2, 3, 4]
 
 
 @needs_fork
 @pytest.mark.parametrize("act", [stop, fail])
 def test_what_a_child_does_not_finish_is_done_here(act: Callable[[], object]) -> None:
     meet = Meeting(lambda: act() if os.getpid() != PARENT else None)
-    assert share([meet] * 2, 2) == [PARENT, PARENT]
+    assert run_tasks([meet] * 2, 2) == [PARENT, PARENT]
 
 
 @needs_fork
@@ -99,7 +99,7 @@ def test_the_first_error_is_raised_whoever_meets_it() -> None:
         return act
 
     with pytest.raises(ValueError, match="one"):
-        share([task("one"), task("two")], 2)
+        run_tasks([task("one"), task("two")], 2)
 
 
 @needs_fork
@@ -110,14 +110,14 @@ def test_an_interrupt_ends_children() -> None:
         signal.pause()
 
     with pytest.raises(KeyboardInterrupt):
-        share([Meeting(interrupt)] * 2, 2)
+        run_tasks([Meeting(interrupt)] * 2, 2)
     assert not multiprocessing.active_children()
 
 
 LEAVES = """
 import multiprocessing, os, signal, time
 from wholearm.common.parallel import Processes
-from wholearm.common.parallel import share
+from wholearm.common.parallel import run_tasks
 
 parent = os.getpid()
 BUSY = "import time; print('ready', flush=True); time.sleep(60)"
@@ -135,7 +135,7 @@ def task():
 
 @needs_fork
 @pytest.mark.parametrize(
-    "run", ["share([task] * 2, 2)", "Processes(1).submit(exec, BUSY).result()"]
+    "run", ["run_tasks([task] * 2, 2)", "Processes(1).submit(exec, BUSY).result()"]
 )
 def test_processes_end_with_their_parent_however_it_ends(run: str) -> None:
     command = [sys.executable, "-c", LEAVES.format(run=run)]
@@ -152,7 +152,7 @@ def test_other_threads_keep_it_in_one_process() -> None:
     thread = threading.Thread(target=over.wait)
     thread.start()
     try:
-        found = share([os.getpid] * 2, 2)
+        found = run_tasks([os.getpid] * 2, 2)
     finally:
         over.set()
         thread.join()
@@ -197,7 +197,7 @@ def test_tasks_are_given_a_few_at_a_time() -> None:
             given.append(number)
             yield number
 
-    answers = run_all(square, draw(1000), ThreadPoolExecutor(1), ahead=4)
+    answers = run_all(square, draw(1000), ThreadPoolExecutor(1), max_pending=4)
     for _ in range(5):
         next(answers)
     assert len(given) <= 5 + 4
@@ -229,7 +229,7 @@ import contextlib, functools, os, signal, sys, time
 from pathlib import Path
 from wholearm.cli.command import hasten
 from wholearm.common.files import together, write_whole
-from wholearm.common.signals import beat, guard, held, interruptible, yielding
+from wholearm.common.signals import beat, defer_signals, guard, interrupt_at_beat, interruptible
 
 stop = functools.partial(signal.raise_signal, int(sys.argv[1]))
 
@@ -252,10 +252,10 @@ finally:
     Path("reached").touch()
 """
 HELD = """
-with held():
+with defer_signals():
     stop()
     Path("one").touch()
-    with held():
+    with defer_signals():
         Path("two").touch()
 Path("three").touch()
 """
@@ -293,7 +293,7 @@ def test_a_signal_ends_a_command(
 
 YIELDS = """
 try:
-    with yielding():
+    with interrupt_at_beat():
         stop()
         {then}
 except KeyboardInterrupt:
@@ -663,6 +663,6 @@ def test_a_member_that_is_too_large_is_not_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = _write(tmp_path / "a.npz", {"t": bytes(2**18 + 1)})
-    monkeypatch.setattr(archive, "LARGEST", 2**18)
+    monkeypatch.setattr(archive, "MAX_BYTES", 2**18)
     with pytest.raises(InputError, match="262145 bytes; allowed are up to 262144"):
         read_arrays(path, ("t",))

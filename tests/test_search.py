@@ -23,7 +23,7 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InputError, SolverError
 from wholearm.common.files import make_folder
-from wholearm.common.parallel import share
+from wholearm.common.parallel import run_tasks
 from wholearm.common.signals import OutOfTime, Reporter
 from wholearm.contacts.closing import close_fingers, contact_table, place_at
 from wholearm.geometry.curve import Curve
@@ -33,12 +33,12 @@ from wholearm.mapping import formation_list
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.lower_bound import bound_least_time
-from wholearm.planning.time_domain.guesses import GIVEN
+from wholearm.planning.time_domain.guesses import PROBLEM_MODES
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.read import build_problem
 from wholearm.problem.table import write_toml
 from wholearm.search import astar, cuts, edge_plans
-from wholearm.search.astar import FINEST, RefinedPath, RouteSearch, bound_borders, search_release
+from wholearm.search.astar import MIN_STEP, RefinedPath, RouteSearch, bound_borders, search_release
 from wholearm.search.astar import Route as SearchRoute
 from wholearm.search.edges import Edge
 from wholearm.search.find_route import find_route, format_phases, load_roadmap, store_roadmap
@@ -100,13 +100,13 @@ def test_under_rate_limits_motions_begin_on_borders_where_torques_hold() -> None
     roadmap, start = Roadmap(problem, 0.1), make_place(problem.scene, problem.start)
     borders = [chain.borders[0] for chain in roadmap.follow(start)]
     borders += [chain.borders[0] for each in borders for chain in roadmap.follow(each.stop)]
-    assert any("verge" in border.limits.begins for border in borders)
+    assert any("verge" in border.limits.no_start for border in borders)
     for border in borders:
         static = Statics(border.formation, border.curve.start)
         (heading,) = border.curve.interpolate(np.zeros(1))[1]
         rates = np.append(static.A_t @ heading, heading[3:])
         along = [signs @ rates for _, signs in static.list_continuous(problem.epsilon) or ()]
-        assert (max(along, default=0) > 0.9 * np.abs(rates).sum()) == (not border.limits.begins)
+        assert (max(along, default=0) > 0.9 * np.abs(rates).sum()) == (not border.limits.no_start)
 
 
 @pytest.mark.parametrize("turned", [{"flush": 0}, {"phi_deg": -1.984}], ids=str)
@@ -205,7 +205,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     plan = solved(LANDING)
     motions = (own if isinstance(own, TimeMotion) else None for own in plan.trajectory.motions)
     pairs = zip(plan.problem.phases, motions, strict=True)
-    phases = edge_plans.list_printed(plan.problem.scene, pairs, guesses=True)
+    phases = edge_plans.round_phases(plan.problem.scene, pairs, guesses=True)
     printed = replace(plan.problem, phases=phases)
     again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
     over_time = [phase.number for phase in plan.phases if phase.modes]
@@ -213,7 +213,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     for one, other in zip(printed.phases, again.phases, strict=True):
         assert (one.until, one.end, one.guess) == (other.until, other.end, other.guess)
     found = wholearm.solve(again, replay=False)
-    assert found.phases[over_time[0] - 1].attempt == GIVEN
+    assert found.phases[over_time[0] - 1].attempt == PROBLEM_MODES
     # The issue allows 1e-4; both refine to that accuracy.
     assert found.duration == pytest.approx(plan.duration, rel=1e-4)
 
@@ -229,7 +229,7 @@ def test_what_is_advised_opens_the_way() -> None:
     for opening in cuts.list_openings(blocked):
         for cut, value in ((blocked[k], value) for k, value in opening.values.items()):
             change = Change(opening.parameter, value)
-            assert isinstance(cuts.edge_changed(cut, change), Edge)
+            assert isinstance(cuts.change_edge(cut, change), Edge)
     planner = astar.RoutePlanner(rough, None, own, PlanOptions(), Reporter(None))
     text, (change,) = cuts.find_opening(planner, 0.0)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
@@ -274,12 +274,12 @@ def test_parts_planned_at_the_same_time_make_the_same_plan() -> None:
     assert tuple(edge for part in parts for edge in part) == route.edges
     assert len(parts) > 1 and not any(part[-1].in_cell for part in parts[:-1])
 
-    def plan(part: list[Edge]) -> edge_plans.PartPlan | edge_plans.Lost:
+    def plan(part: list[Edge]) -> edge_plans.PartPlan | edge_plans.PlanFailure:
         begin = replace(problem, start=part[0].start.z)
         return edge_plans.plan_part(begin, [(edge, None) for edge in part], OPTIONS, lambda _: None)
 
     tasks = [partial(plan, part) for part in parts]
-    for one, other in zip(share(tasks, 1), share(tasks, 2), strict=True):
+    for one, other in zip(run_tasks(tasks, 1), run_tasks(tasks, 2), strict=True):
         assert isinstance(one, list) and isinstance(other, list), (one, other)
         # Solves in another process may differ in the last bits, and by the solver's tolerance then.
         for (mine, motion), (theirs, again) in zip(one, other, strict=True):
@@ -296,7 +296,7 @@ def test_edges_that_cannot_be_planned_are_named() -> None:
     problem = problem_of(HEPTAGON).with_(torque_limit=0.02)
     edges = [(edge, None) for edge in edge_plans.split_route(route.edges)[0]]
     lost = edge_plans.plan_part(problem, edges, OPTIONS, lambda _: None)
-    assert isinstance(lost, edge_plans.Lost) and lost.phases == [1]
+    assert isinstance(lost, edge_plans.PlanFailure) and lost.phases == [1]
     assert "until" in lost and "phase 1" in lost
 
 
@@ -306,14 +306,14 @@ def test_edges_of_phases_without_a_plan_are_left_out_of_other_routes(
 ) -> None:
     """After a failure without known phases other guesses and routes of the same edges are tried."""
     own, route = to_edge_6()
-    failed = edge_plans.Lost("no plan")
+    failed = edge_plans.PlanFailure("no plan")
     failed.phases, plan = phases, Mock(return_value=failed)
     monkeypatch.setattr(astar, "plan_phases", plan)
     monkeypatch.setattr(astar.RoutePlanner, "_plan_parts", Mock(return_value=[]))
     silent, problem = Reporter(None), problem_of(HEPTAGON)
-    planner = astar.RoutePlanner(problem, None, own, OPTIONS, silent, found=[route, route])
+    planner = astar.RoutePlanner(problem, None, own, OPTIONS, silent, routes=[route, route])
     planner.plan()
-    assert not planner.made and planner.failures == ["no plan"] * tries
+    assert not planner.plans and planner.failures == ["no plan"] * tries
     assert failed.edges == route.edges[lost] and plan.call_count == tries**2
 
 
@@ -324,9 +324,9 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     def plan(path: RefinedPath, _: object) -> edge_plans.CoarsePlan | None:
         if path.move is None or path.move < end:
             return None
-        return edge_plans.CoarsePlan(1 + FINEST * abs(path.move - best), (), [])
+        return edge_plans.CoarsePlan(1 + MIN_STEP * abs(path.move - best), (), [])
 
-    found, *others = search_release(plan, edge_plans.CoarsePlan(1 + FINEST * abs(best), (), []))
+    found, *others = search_release(plan, edge_plans.CoarsePlan(1 + MIN_STEP * abs(best), (), []))
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
     plan_on = lambda path, one: one._replace(duration=0.9) if one else plan(path, one)  # noqa: E731

@@ -28,18 +28,12 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan, Plans
 from wholearm.planning.replay_check import make_table
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
-from wholearm.problem.read import build_problem, read_own_problem
+from wholearm.problem.read import build_problem, read_stored_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import (
-    DRIVE,
-    find_rest,
-    find_standstill,
-    maximise_margin,
-    require_closed,
-)
+from wholearm.simulation.modes import DRIVE, Rest, find_standstill, maximise_margin, require_closed
 from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
@@ -129,13 +123,13 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
         gained = Formation(problem.scene, (phase.until.contact,))
         normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
-        first = find_rest(phase.formation, z).sliding[0]
+        first = Rest(phase.formation, z).sliding[0]
         assert first.heading is not None
         back = settling.gap / (normal @ first.heading) * first.heading
         z = require_closed(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
-        tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).sliding
+        tau, (one, two) = np.array(settling.tau), Rest(phase.formation, z).sliding
         assert one.heading is not None and two.heading is not None
         way = one if normal @ one.heading < 0 else two
         closing = -float(normal @ way.heading) * way.drive(tau)
@@ -427,7 +421,7 @@ def test_torques_are_held_from_period_to_period(hold: str, tmp_path: Path) -> No
     plan.save(path)
     known = load_plan(path)
     assert known.phases[0].unheld == free
-    scene = read_own_problem(known.trajectory.meta, path).scene
+    scene = read_stored_problem(known.trajectory.meta, path).scene
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
 
 

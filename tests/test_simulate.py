@@ -40,7 +40,7 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
 from wholearm.simulation import system
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import Collapse, find_rest
+from wholearm.simulation.modes import Collapse, Rest
 from wholearm.simulation.prescribed import Replay
 
 
@@ -186,7 +186,7 @@ def test_balance_is_lost_where_no_forces_are_left(bend: float) -> None:
     formation, z = problem.phases[0].formation, problem.start
     opening = np.array([-1.0, 1.0])
     coefficients = np.outer(opening, [0.01, 0.01 + bend, 0.0, -bend])
-    lost = find_rest(formation, z).wait(coefficients, -1.0)
+    lost = Rest(formation, z).wait(coefficients, -1.0)
     assert isinstance(lost, Collapse) and -0.1 < lost.x < 0.1
     for x, holds in ((lost.x - 1e-4, True), (lost.x + 1e-4, False)):
         tau = coefficients @ x ** np.arange(4)
@@ -300,7 +300,7 @@ def test_jamming_is_an_error_that_names_phase_and_time() -> None:
 def test_a_jammed_formation_at_rest() -> None:
     problem, motion = pick(1)
     rough = problem.with_(friction=1.5)
-    rest = find_rest(rough.phases[0].formation, rough.start)
+    rest = Rest(rough.phases[0].formation, rough.start)
     assert max(way.response.ratio for way in rest.sliding) < 0
     simulation = simulate(rough, constant((0.0, 0.0)))
     assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
@@ -362,7 +362,7 @@ def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
     def fall(x: float) -> float:
         return 1e-6 * math.copysign(abs(root - x) ** power, root - x)
 
-    found = find_root(fall, 0.0, 1.0, near=1e-12)
+    found = find_root(fall, 0.0, 1.0, x_tolerance=1e-12)
     # The bracket is at most 1e-12 wide at the end.
     assert found == pytest.approx(root, abs=1e-12)
 

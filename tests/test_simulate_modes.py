@@ -544,7 +544,7 @@ def landing_from_rest() -> Problem:
 def test_start_with_two_freedoms() -> None:
     moving, rng = landing_from_rest(), np.random.default_rng(3)
     (phase,), z = moving.phases, moving.start
-    rest, seen = modes.find_rest(phase.formation, z), 0
+    rest, seen = modes.Rest(phase.formation, z), 0
     assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
     assert len(list(rest.list_modes())) == 2**5 + 5 * 2**4
@@ -608,7 +608,7 @@ def test_a_start_shows_once_its_acceleration_exceeds_rounding() -> None:
     problem = problem_of(HEXAGON).with_({"vertices": corners, "start": start, "phases": phases})
     torques = [[0.1185525643378136, 0.04320277349437667, -0.00030286699521259175]]
     torques += [[-1.1310188153889746, -0.5855907965602957, 7.361256049165377e-11]]
-    rest = modes.find_rest(problem.phases[0].formation, problem.start)
+    rest = modes.Rest(problem.phases[0].formation, problem.start)
     departure = rest.wait(np.array(torques), -1.0)
     assert isinstance(departure, modes.StartDeparture) and departure.x < -1 + 1e-5
 

@@ -26,10 +26,10 @@ from wholearm.mechanics.dynamics import Directions, close_contacts, metric_weigh
 from wholearm.planning.nlp import Columns, Kernel, NlpRows, build_kernel, build_solver
 from wholearm.planning.time_domain import time_nlp
 from wholearm.planning.time_domain.stage import (
-    LimitMisses,
+    LimitViolations,
     Scheme,
     Stage,
-    blend,
+    bernstein,
     fit_controls,
     make_scheme,
 )
@@ -71,20 +71,20 @@ def test_schemes_are_those_of_radau_and_gauss(name: str, degree: int) -> None:
     """Butcher's conditions B(order) and C(degree), of which there is one solution for each name."""
     scheme = make_scheme(name, degree)
     assert scheme.order == {"radau": 2 * degree - 1, "legendre": 2 * degree}[name]
-    assert (scheme.rungs[-1] > 0).all() and (np.diff(scheme.points) > 0).all()
+    assert (scheme.weights[-1] > 0).all() and (np.diff(scheme.points) > 0).all()
     # The inverse of the powers has a condition number of up to 1e5.
-    for power in range(scheme.order):
-        assert scheme.rungs[-1] @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-10)
-    over = scheme.rungs[-1] @ scheme.points**scheme.order - 1 / (scheme.order + 1)
+    for p in range(scheme.order):
+        assert scheme.weights[-1] @ scheme.points**p == pytest.approx(1 / (p + 1), abs=1e-10)
+    over = scheme.weights[-1] @ scheme.points**scheme.order - 1 / (scheme.order + 1)
     assert abs(over) > 1e-8
     for power in range(degree):
         exact = scheme.points ** (power + 1) / (power + 1)
-        error = scheme.rungs[:degree] @ scheme.points**power - exact
+        error = scheme.weights[:degree] @ scheme.points**power - exact
         assert np.abs(error).max() < 1e-10
-    assert scheme.ends == (name == "radau")
-    if scheme.ends:
+    assert scheme.has_end == (name == "radau")
+    if scheme.has_end:
         assert scheme.points[-1] == pytest.approx(1.0, abs=1e-14)
-    assert len(scheme.rungs) == degree + (not scheme.ends)
+    assert len(scheme.weights) == degree + (not scheme.has_end)
 
 
 STEP = 1e-4
@@ -241,7 +241,7 @@ def collocation(name: str, degree: int, count: int, contacts: int) -> tuple[Arra
     equations, _ = misses(nlp, packed(nlp, [stage]))
     rows = nlp.rows_of[0]
     own = equations[rows.states]
-    assert own.shape == (count, 2, degree + (not scheme.ends), 5 - stage.formation.n_constraints)
+    assert own.shape == (count, 2, degree + (not scheme.has_end), 5 - stage.formation.n_constraints)
     # Everything else holds at once but rest at the end: contacts, balances, contacts at the ends.
     # The reference differentiates contacts by differences over a microsecond.
     rest = 5 - stage.formation.n_constraints
@@ -274,7 +274,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     nlp = build_nlp([stage], scheme)
     x = packed(nlp, [stage])
     (low_x, high_x), (low, _) = time_nlp.find_bounds(
-        nlp, [stage], scheme, [LimitMisses.none(stage)]
+        nlp, [stage], scheme, [LimitViolations.none(stage)]
     )
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
@@ -290,7 +290,7 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
     wrong = replace(stage, directions=Directions(signs[:4], signs[4:]))
     nlp = build_nlp([wrong], scheme)
     x = packed(nlp, [wrong])
-    (low, high), _ = time_nlp.find_bounds(nlp, [wrong], scheme, [LimitMisses.none(wrong)])
+    (low, high), _ = time_nlp.find_bounds(nlp, [wrong], scheme, [LimitViolations.none(wrong)])
     worst = max(misses(nlp, x)[1].max(), (low - x).max(), (x - high).max())
     assert worst > 0.02
 
@@ -310,7 +310,7 @@ def test_what_is_made_least(objective: Objective) -> None:
 def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build_nlp([stage], scheme, Objective.MARGIN)
-    (low_x, _), (low, _) = time_nlp.find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
+    (low_x, _), (low, _) = time_nlp.find_bounds(nlp, [stage], scheme, [LimitViolations.none(stage)])
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05
@@ -401,13 +401,13 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
 def test_polynomials_lie_between_their_control_points(count: int) -> None:
     rng, places = np.random.default_rng(count), np.linspace(0.0, 1.0, 41)
     controls = rng.uniform(-1.0, 1.0, (count, 2))
-    values = blend(places, count) @ controls
+    values = bernstein(places, count) @ controls
     assert (values <= controls.max(axis=0) + 1e-14).all()
     assert (values >= controls.min(axis=0) - 1e-14).all()
     np.testing.assert_allclose(values[[0, -1]], controls[[0, -1]], atol=1e-13)
     # Of their degree they are: their control points follow from as many values.
     at = np.sort(rng.uniform(0.0, 1.0, count))
-    fitted = fit_controls(at, blend(at, count) @ controls, count)
+    fitted = fit_controls(at, bernstein(at, count) @ controls, count)
     np.testing.assert_allclose(fitted, controls, atol=1e-6)
 
 
@@ -421,7 +421,7 @@ def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> N
     bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
     still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
     n_p, n_c = after.n_constraints, after.n_contacts
-    assert time_nlp.find_leaving(before, after) == [1]
+    assert time_nlp.find_released(before, after) == [1]
     for _ in range(3):
         z, v_after, v_before = draw(rng)
         impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)

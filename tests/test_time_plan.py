@@ -36,16 +36,16 @@ from wholearm.planning.path_domain.path_plan import Task, plan_curves
 from wholearm.planning.phase_plan import PlanPart, plan_stops
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_nlp, time_plan
-from wholearm.planning.time_domain.guesses import NEAREST, Guess, guess_stages, list_stages
-from wholearm.planning.time_domain.mode_search import drop, in_mode, link, mode_of
+from wholearm.planning.time_domain.guesses import NEAREST_END, Guess, guess_stages, list_stages
+from wholearm.planning.time_domain.mode_search import drop, link, mode_of, with_mode
 from wholearm.planning.time_domain.solution import (
     ITERATIONS,
     SETTINGS,
     TimeSearch,
     TimeSolution,
-    find_least,
+    minimize_quadratic,
 )
-from wholearm.planning.time_domain.stage import Stage, in_own_units, resample
+from wholearm.planning.time_domain.stage import Stage, in_scene_units, resample
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
@@ -172,7 +172,7 @@ def test_modes_without_freedom_are_refused_without_the_solver(
     search = TimeSearch(landing(), PlanOptions(), controls=1)
     stage = list_stages(plan_landing())[-1]
     guess = resample(stage.guess, search.scheme, np.array([0.0, 1.0]))
-    solution = search.solve([replace(stage, guess=guess, turns=(0, 1))])
+    solution = search.solve([replace(stage, guess=guess, reversals=(0, 1))])
     assert not solution.success and "more equations than unknowns" in solution.status
     assert capfd.readouterr() == ("", "")
 
@@ -290,7 +290,7 @@ def test_little_less_friction_takes_little_more_time() -> None:
     for friction in (0.07, 0.06):
         problem = shipped.part_of(shipped.problem_of(shipped.HEPTAGON).with_(friction=friction), 4)
         given = problem, problem.phases, problem.start, PlanOptions()
-        lasts.append(total(plan_phases(*given, only_begin=True)))
+        lasts.append(total(plan_phases(*given, coarse=True)))
     assert lasts[1] == pytest.approx(lasts[0], rel=0.03)
 
 
@@ -309,7 +309,7 @@ def test_given_modes_are_compared_where_their_plan_takes_far_longer() -> None:
         table["fingers"][finger]["base"][0] = x
     problem = build_problem(table)
     z = np.array([-0.03378038, 0.04124561, 2.36886814, 2.37978117, 1.58346998])
-    (plan,) = plan_phases(problem, problem.phases[1:], z, PlanOptions(), only_begin=True)
+    (plan,) = plan_phases(problem, problem.phases[1:], z, PlanOptions(), coarse=True)
     assert plan.motion.duration < 0.1
 
 
@@ -466,7 +466,7 @@ def test_a_worse_optimum_than_along_the_curve_is_not_kept(monkeypatch: pytest.Mo
 
     def worsen(search: TimeSearch, guesses: Sequence[Guess]) -> TimeSolution | None:
         solution = solve_guesses(search, guesses)
-        if solution is None or guesses[0].name == NEAREST:
+        if solution is None or guesses[0].name == NEAREST_END:
             return solution
         stages = [stage.stretch(1.01) for stage in solution.stages]
         return solution._replace(stages=stages, cost=1.01 * solution.cost)
@@ -503,7 +503,7 @@ def test_a_part_of_a_block_starts_at_rest() -> None:
     first, free = plan_curves(Task(curves, own.epsilon, options, (1, 2)))
     assert np.abs(free.motion.evaluate(np.zeros(1)).z_dot).max() > 0.1
     z = first.motion.evaluate(np.array([first.motion.duration])).z[0]
-    (part,) = plan_phases(own, own.phases[1:], z, options, free=[free])
+    (part,) = plan_phases(own, own.phases[1:], z, options, free_plans=[free])
     assert np.abs(part.motion.evaluate(np.zeros(1)).z_dot).max() < 1e-9
 
 
@@ -569,7 +569,7 @@ def test_velocities_jump_by_the_impact_law(objective: str, over_time: bool) -> N
         assert np.sqrt(metric @ v_next**2) == pytest.approx(row["velocity_ratio"] * speed, rel=1e-5)
         impact = compute_impact(before, after, z, v)
         np.testing.assert_allclose(v_next, impact.v, rtol=0, atol=close)
-        assert impact.least[0] == row["least_impulse_contact"]
+        assert impact.least_impulse[0] == row["least_impulse_contact"]
         # The contacts of the next formation neither part nor press into one another.
         assert np.abs(measure_gaps(after, z)).max() < 1e-8
         assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < close
@@ -692,9 +692,9 @@ def test_changed_stages_begin_and_end_where_they_did() -> None:
     left = drop(last, 0)
     assert left and np.array_equal(left[0].guess.nodes[0], last[0].guess.nodes[0])
     # A given end determines a pose in modes without freedoms, too.
-    stuck, end = in_mode(last[-1], (0.0,) * len(mode_of(last[-1]))), last[-1].guess.nodes[-1, 0]
-    (stage,) = Guess("", [stuck]).end_at(end, in_own_units(landing())).stages
-    assert stage.stop is not None and np.isfinite(stage.stop).sum() == 2
+    stuck, end = with_mode(last[-1], (0.0,) * len(mode_of(last[-1]))), last[-1].guess.nodes[-1, 0]
+    (stage,) = Guess("", [stuck]).end_at(end, in_scene_units(landing())).stages
+    assert stage.end_pose is not None and np.isfinite(stage.end_pose).sum() == 2
 
 
 def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
@@ -820,13 +820,13 @@ def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
     problem, share = landing(), 1e-3
     start = trace_phases(problem)[-1].end
     least = PlanOptions(objective="effort", time_intervals=8)
-    begun = try_phases(problem, problem.phases[4:], start, least, further=True)
+    begun = try_phases(problem, problem.phases[4:], start, least, all_guesses=True)
     assert begun is not None
     solution = TimeSearch(problem, least).solve(list_stages(begun))
     assert solution.success
 
     def value(other: Problem) -> float:
-        formations = [phase.formation for phase in in_own_units(other).phases]
+        formations = [phase.formation for phase in in_scene_units(other).phases]
         stages = [replace(one, formation=formations[one.phase]) for one in solution.stages]
         nlp = TimeSearch(other, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
@@ -854,7 +854,7 @@ def test_the_least_over_a_polygon_is_that_of_a_solver(square: float) -> None:
     rows = np.concatenate([rng.normal(size=(30, 3, 2)), sides], axis=1)
     slack = rng.uniform(0.0, 2.0, rows.shape[:2]) * (rng.uniform(size=rows.shape[:2]) > 0.2)
     slopes = rng.normal(size=(30, 2))
-    least = find_least(slopes, square, rows, slack)
+    least = minimize_quadratic(slopes, square, rows, slack)
     for k, slope in enumerate(slopes):
         limits = {"type": "ineq", "fun": lambda u, k=k: rows[k] @ u + slack[k]}
         answer = minimize(

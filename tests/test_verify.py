@@ -28,8 +28,8 @@ from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.plan import solve
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
-from wholearm.verification.newton_euler import BEYOND, Balance, balance
-from wholearm.verification.verify import STRAY, Allowance, list_normal_forces, measure_stray, verify
+from wholearm.verification.newton_euler import CONE_TOLERANCE, Balance, balance
+from wholearm.verification.verify import DEFICIT, Allowance, list_normal_forces, max_deficit, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 
@@ -71,7 +71,7 @@ def test_virtual_power() -> None:
     power += (c_t * np.einsum("nij,nj->ni", rows.A_t, w)).sum(axis=1)
     expected = (found.forces * units(scene) * w).sum(axis=1)
     np.testing.assert_allclose(expected, power, rtol=1e-11, atol=1e-12)
-    assert not found.against.any()
+    assert not found.wrong_sign.any()
 
 
 def phases_of(problem: Problem, trajectory: Trajectory) -> list[tuple[Formation, Samples]]:
@@ -86,7 +86,7 @@ def test_motions_with_their_forces_balance(case: object) -> None:
     assert callable(case)
     for formation, samples in phases_of(*case()):
         found = check(formation, samples)
-        assert not found.against.any()
+        assert not found.wrong_sign.any()
         size, _, text = found.find_worst()
         # Configurations of the landing are closed to 1e-12.
         assert size < 1e-9, text
@@ -98,7 +98,7 @@ def test_friction_the_wrong_way_is_named() -> None:
     c_t = samples.c_t.copy()
     c_t[100:110, column] *= -1
     found = check(formation, samples._replace(c_t=c_t))
-    assert found.against[100:110, column].all() and found.against.sum() == 10
+    assert found.wrong_sign[100:110, column].all() and found.wrong_sign.sum() == 10
     # Friction is taken from the velocities, so that what balances is still the motion itself.
     assert found.find_worst()[0] < 1e-9
 
@@ -123,7 +123,7 @@ def test_at_rest_friction_may_be_anything_in_its_cone() -> None:
     uneven = np.column_stack([push, 0 * push])
     forces = check(formation, Samples(z, rest, rest, 0 * tau, c_n, uneven)).forces
     # As far beyond as plans may miss limits.
-    cone = 0.3 * weight / 2 + BEYOND * scene.scales.force
+    cone = 0.3 * weight / 2 + CONE_TOLERANCE * scene.scales.force
     np.testing.assert_allclose(forces[:, 0] * scene.scales.force, np.minimum(push, cone))
 
 
@@ -464,9 +464,9 @@ def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
     least = np.nanmin(fine.c_n)
     lowest = int(np.where(np.isnan(fine.c_n), np.inf, fine.c_n).min(axis=1).argmin())
     assert least > 0.0 and start < fine.t[lowest] < stop
-    rounding = measure_stray(problem) - STRAY * problem.epsilon
+    rounding = max_deficit(problem) - DEFICIT * problem.epsilon
     for more, fails in (1e-3, True), (-1e-3, False):
-        epsilon = (least + rounding) / (1 - STRAY - more)
+        epsilon = (least + rounding) / (1 - DEFICIT - more)
         texts = verify(problem.with_(epsilon=epsilon), torque).warnings
         assert any(" falls to " in text for text in texts) is fails
 
@@ -554,10 +554,10 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more() -> None:
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
     held, figures = replay_check.replay_plan(replace(planning, problem=slide), lambda _: None)
     assert figures.least_c_n.value > slide.epsilon
-    assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
+    assert (rise := held.extra_epsilon) == {0: pytest.approx(self_check.INCREASE * short, rel=0.05)}
     loss = 1 - planning.plans[0].value / held.plans[0].value
     assert 1e-3 < loss < held.plans[0].error < 2.5 * loss
-    assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
+    assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + rise[0], abs=1e-5)
 
 
 def test_a_plan_that_jams_in_its_replay_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -594,7 +594,7 @@ def test_a_contact_that_is_let_go_counts_until_then() -> None:
     phase = verify(problem, trajectory).phases[0]
     assert phase.until == "release of v3-finger1"
     margins = {margin.contact: margin for margin in phase.contacts}
-    assert margins["v3-finger1"].least > problem.epsilon - measure_stray(problem)
+    assert margins["v3-finger1"].least > problem.epsilon - max_deficit(problem)
     contact, least, time, _ = min(phase.contacts, key=lambda margin: margin.least)
     assert phase.least_force == (least, contact, 1, time)
     assert phase._replace(contacts=()).least_force is None

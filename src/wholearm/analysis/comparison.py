@@ -21,45 +21,45 @@ from ..results.trajectory import Trajectory, load_trajectory
 from ..verification.verify import verify
 
 SIMULATIONS = "simulations"
-"""Key of a comment of torques, and of the `meta` of a trajectory, with how many it took."""
+"""Key of the number of simulations, in comments of torques and in the `meta` of a trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """What one plan or one table of torques does."""
+    """Replay of one plan or one table of torques, in numbers."""
 
-    name: str  # the file: without its folder where that is enough
+    name: str  # the file: without its folder if that is unique
     ok: bool  # whether every contact held and the goal was reached
-    reason: str  # the sentence behind that
-    duration: float  # [s]: until the goal is reached, or of the torques where it is not
+    reason: str  # of the verdict, a sentence
+    duration: float  # [s]: until the goal is reached, or of the torques if it is not
     effort: float  # [(N m)^2 s]: integral of tau^T tau
     peaks: tuple[float, float]  # [N m]: largest torque of each joint
-    simulations: int | None  # how many it took to find it, if that is known
+    simulations: int | None  # number of simulations that were needed to find it, if stored
     # [N]: least margin of a normal force over epsilon in the replay, of `contact` in `phase`
     margin: float | None = None
     contact: str = ""
     phase: int = 0
     lost: float | None = None  # [J]: energy lost to friction and impacts
-    # lasts, margins [s] and [N]: durations of the phases that were entered, and the least margin of
-    # each; NaN where unknown
+    # lasts, margins [s] and [N]: duration and least margin of each phase that was entered; NaN
+    # where unknown
     lasts: tuple[float, ...] = ()
     margins: tuple[float, ...] = ()
-    report: Report | None = field(default=None, repr=False)  # none where the replay could not go on
-    # with the phases that it goes through
+    report: Report | None = field(default=None, repr=False)  # None if the replay stopped
+    # with the phases of the motion
     problem: Problem | None = field(default=None, repr=False)
-    # the motion that was given; None for torques alone
+    # the motion of the file; None for torques alone
     planned: Trajectory | None = field(default=None, repr=False)
 
     @property
     def replayed(self) -> Trajectory | None:
-        """The motion of the replay; None where it loses a contact at once, or could not go on."""
+        """The motion of the replay; None if it loses a contact at once, or stopped."""
         with suppress(SimulationError):
             return None if self.report is None else self.report.trajectory
         return None
 
     @property
     def verdict(self) -> str:
-        """Whether it holds, in a word."""
+        """`ok` as a word."""
         return "ok" if self.ok else "FAILED"
 
     @property
@@ -83,12 +83,12 @@ class Comparison(Result):
 
     @property
     def ok(self) -> bool:
-        """Whether all of them hold."""
+        """Whether all plans and torques are ok."""
         return all(contender.ok for contender in self.contenders)
 
     @property
     def summary(self) -> Table:
-        """What each comes to."""
+        """Table of all plans and torques."""
         columns = {
             "name": "", "verdict": "verdict", "duration": "until the goal [s]:.5f",
             "effort": "effort [(N m)^2 s]:.5f", "margin": "least margin [N]:+z.5f", "place": "of",
@@ -99,14 +99,14 @@ class Comparison(Result):
 
     @property
     def document(self) -> Document:
-        """A table of all, one of their phases, and the reasons of those that fail."""
+        """A table of all, one of their phases, and reasons of failures."""
         failed = [f"{each.name}: {each.reason}" for each in self.contenders if not each.ok]
         names = [contender.name for contender in self.contenders]
         heads = [f"{name}:{form}" for form in (".5f", "+z.4f") for name in names]
         lasts = zip_longest(*(contender.lasts for contender in self.contenders))
         margins = zip_longest(*(contender.margins for contender in self.contenders))
         pairs = zip(lasts, margins, strict=True)
-        rows = [(number, *one, *two) for number, (one, two) in enumerate(pairs, start=1)]
+        rows = [(number, *times, *least) for number, (times, least) in enumerate(pairs, start=1)]
         title = "phases: times until their ends [s], then least margins [N]"
         phases = Table(["phase:d", *heads], rows, title)
         head = f"{self.name}, epsilon = {self.epsilon:g} N"
@@ -118,7 +118,7 @@ def compare(
 ) -> Comparison:
     """Replay trajectory files (.npz) and torques (.csv) for a problem, and compare them.
 
-    `progress` is told which of them is replayed.
+    `progress` is called with the name of each file before its replay.
 
     InputError if a file cannot be read, or a trajectory is one of another problem; names the file.
     """
@@ -135,15 +135,15 @@ def compare(
 def _judge(name: str, problem: Problem, path: str) -> Contender:
     """The replay of a trajectory or of torques, in numbers.
 
-    Goals of the problem give way to the phases that a trajectory has forces.
+    The phases of a trajectory with forces replace a goal of the problem.
     """
     planned = None
     if require_ending(path, ".npz", ".csv") == ".csv":
-        noted = read_notes(path).get(SIMULATIONS)
-        if noted is not None and not noted.isdecimal():
-            raise InputError(path, SIMULATIONS, f"{noted!r} given; a whole number is needed")
+        note = read_notes(path).get(SIMULATIONS)
+        if note is not None and not note.isdecimal():
+            raise InputError(path, SIMULATIONS, f"{note!r} given; a whole number is needed")
         require_phases(problem)
-        torque, simulations = read_torque_csv(path), None if noted is None else int(noted)
+        torque, simulations = read_torque_csv(path), None if note is None else int(note)
     else:
         planned = load_trajectory(path)
         torque, meta = planned.torque, planned.meta
@@ -152,8 +152,8 @@ def _judge(name: str, problem: Problem, path: str) -> Contender:
             require_made_for(problem, meta)
         simulations = (meta.get("replay") or {}).get(SIMULATIONS, meta.get(SIMULATIONS))
         simulations = simulations if isinstance(simulations, int) else None
-    one, two = torque.peaks.max(axis=0).tolist()
-    numbers = torque.duration, torque.integrate_squares(), (one, two), simulations
+    peak1, peak2 = torque.peaks.max(axis=0).tolist()
+    numbers = torque.duration, torque.integrate_squares(), (peak1, peak2), simulations
     contender = Contender(name, False, "", *numbers, problem=problem, planned=planned)
     try:
         report = verify(problem, planned or torque)

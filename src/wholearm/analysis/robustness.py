@@ -1,4 +1,4 @@
-"""Robustness by Latin-hypercube sampling: replays, shares with Wilson intervals, sensitivities.
+"""Robustness by Latin-hypercube sampling: success rates with Wilson intervals, sensitivities.
 
 A sample is a replay in a perturbed scene by complementarity simulation, compared with the plan:
 parametric ranges, and sample-and-hold, gains and delay of the torques.
@@ -33,7 +33,7 @@ from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation.events import OutcomeKind, Simulation
 from ..simulation.simulate import simulate_free
-from ..verification.free import MOMENT, REACHED, TURNED, find_touch, list_aliases, list_gained
+from ..verification.free import END_ANGLE, END_SHIFT, GRACE, find_touch, list_aliases, list_gained
 
 Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 
@@ -41,8 +41,7 @@ Task = tuple[int, tuple[float, ...]]  # number and values of a sample
 def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:
     """Samples of a Latin hypercube, shape (count, size), in [0, 1).
 
-    Each column has one sample in each of `count` slices, so that the effect of a number does not
-    drown in that of the others.
+    Each column has one sample in each of `count` slices: the effect of each number is well sampled.
     """
     generator = np.random.default_rng(seed)
     slices = generator.permuted(np.tile(np.arange(count)[:, None], size), axis=0)
@@ -51,23 +50,22 @@ def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Half widths of the ranges, by name of the parameter, and how torques are carried out.
+    """Half widths of the ranges by parameter, execution of torques, tolerances of the goal.
 
-    InputError if a name is unknown, or a width is not a number from zero to what makes sense: below
-    one for relative ones.
+    InputError if a name is unknown, or a width is out of its range: below one for relative ones.
     """
 
-    # those that are left out have their defaults; zero leaves a parameter as it is
+    # missing ones have their defaults; a parameter with zero is constant
     widths: Mapping[str, float] = field(default_factory=dict)
     # [Hz]: of a sample-and-hold of the torques, whose first sample is anywhere in a period; None
     # for torques as planned
     sample_rate: float | None = 1000.0
-    # of the simulations of samples, relative to the scene: far below what counts as the goal
+    # of the simulations of samples, relative to the scene: far below the tolerances of the goal
     tolerance: float = 1e-6
-    # [m]: how far from the planned place a goal counts as reached; `REACHED` of the scene's length
+    # [m]: largest distance from the planned place at a goal; `END_SHIFT` of the scene's length
     # if left out
     distance: float | None = None
-    angle: float = TURNED  # [rad]: how far from the planned angle
+    angle: float = END_ANGLE  # [rad]: largest difference from the planned angle at a goal
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", read_widths(self.widths, "range of {}"))
@@ -78,8 +76,8 @@ class Uncertainty:
         require_number(self.angle, "goal angle", positive=True)
 
     def find_distance(self, scene: Scene) -> float:
-        """How far from the planned place a goal counts as reached [m]."""
-        return REACHED * scene.scales.length if self.distance is None else self.distance
+        """Largest distance from the planned place at a goal [m]."""
+        return END_SHIFT * scene.scales.length if self.distance is None else self.distance
 
     @property
     def varied(self) -> tuple[Field, ...]:
@@ -89,16 +87,16 @@ class Uncertainty:
     def draw(self, count: int, seed: int | tuple[int, int]) -> Array:
         """Samples of a Latin hypercube, shape (count, len(varied) + 1).
 
-        The last column is where in a period of the sample-and-hold the torques begin, in [0, 1).
+        The last column is the phase of the sample-and-hold at the start of the torques, in [0, 1).
         """
-        shares = draw_cube(count, len(self.varied) + 1, seed)
+        cube = draw_cube(count, len(self.varied) + 1, seed)
         low = np.array([0 if parameter.name == "delay" else -1 for parameter in self.varied])
         widths = np.array([self.widths[parameter.name] for parameter in self.varied])
-        return np.column_stack([(low + (1 - low) * shares[:, :-1]) * widths, shares[:, -1]])
+        return np.column_stack([(low + (1 - low) * cube[:, :-1]) * widths, cube[:, -1]])
 
 
 def change_problem(problem: Problem, changes: Mapping[str, float]) -> Problem:
-    """The problem in the scene that `change_scene` makes; its start is left as it is."""
+    """The problem in the scene changed by `change_scene`, with the same start."""
     return replace(problem, scene=change_scene(problem.scene, changes))
 
 
@@ -108,18 +106,18 @@ def change_torques(
     sample_rate: float | None = None,
     offset: float = 0.0,
 ) -> TorqueProfile:
-    """Torques as they are carried out: sampled and held, late, and of the wrong size.
+    """Torques as executed: with sample-and-hold, delay and errors of gains.
 
     Changes are `gain1` and `gain2`, relative, and `delay` [s], during which the first torques hold.
-    The first sample at a rate [Hz] is early by a share `offset` of a period, in [0, 1).
+    The first sample is early by a fraction `offset` of a period, in [0, 1).
     """
     breaks, coefficients = torque.breaks, torque.coefficients
     if sample_rate is not None:
         start, stop = torque.breaks[0], torque.breaks[-1]
         ticks = np.arange(1, np.ceil((stop - start) * sample_rate) + 1) - offset
-        inner = start + ticks / sample_rate
-        inner = inner[(inner > start) & (inner < stop)]
-        breaks = np.concatenate([[start], inner, [stop]])
+        samples = start + ticks / sample_rate
+        samples = samples[(samples > start) & (samples < stop)]
+        breaks = np.concatenate([[start], samples, [stop]])
         coefficients = torque.at(breaks[:-1])[:, :, None]
     gains = 1 + np.array([changes.get("gain1", 0.0), changes.get("gain2", 0.0)])
     coefficients = coefficients * gains[:, None]
@@ -134,27 +132,27 @@ def change_torques(
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What is tried: a plan or one phase of it, with numbers that are off."""
+    """A plan, or one phase of it, and its execution with changed parameters."""
 
     problem: Problem
     torque: TorqueProfile  # from time 0 on
-    # (5,): configuration at the start, at rest. Where numbers are off the object is put on the palm
-    # at the same x and phi, and the fingers are closed on it.
+    # (5,): configuration at the start, at rest. With changed parameters the object is put on the
+    # palm at the same x and phi, and the fingers are closed on it.
     state: Array
     phases: tuple[Phase, ...]
-    stops: tuple[float, ...]  # [s]: when they end, by the clock of the plan
-    goal: Array  # (3,): the pose that is planned for the end
+    stops: tuple[float, ...]  # [s]: ends of the phases in the plan
+    goal: Array  # (3,): the planned pose at the end
     uncertainty: Uncertainty
-    # what the torques are by, instead of the clock; its period is that of the samples
+    # feedback instead of planned torques; its period is that of the samples
     policy: Policy | None = None
 
     def run(self, task: Task) -> dict[str, Any]:
-        """What becomes of one sample, by number a row of `Uncertainty.draw`, as plain values.
+        """Record of the simulation of a sample, a numbered row of `Uncertainty.draw`.
 
-        These are `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
+        Keys: `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
         contact that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n [N]
-        of planned contacts; `path`, poses at even distances, of the first 200, as many as figures
-        need; `ended`, empty or why the simulation ended early or could not begin.
+        of planned contacts; `path`, poses at even distances, for figures, of the first 200 samples;
+        `ended`, the reason if the simulation ended early or could not begin, or empty.
         """
         number, (*sample, offset) = task
         names = [parameter.name for parameter in self.uncertainty.varied]
@@ -167,27 +165,27 @@ class Trial:
     def change(
         self, changes: Mapping[str, float], rate: float | None = None, offset: float = 0.0
     ) -> dict[str, Any]:
-        """The same for numbers that are off by `changes`, torques sampled and held at a rate."""
-        what: TorqueProfile | ClosedLoop
+        """Record of the simulation with `changes` of parameters, and sample-and-hold at a rate."""
+        execution: TorqueProfile | ClosedLoop
         if self.policy is None:
-            what = change_torques(self.torque, changes, rate, offset)
+            execution = change_torques(self.torque, changes, rate, offset)
         else:
             gains = (1 + changes.get("gain1", 0.0), 1 + changes.get("gain2", 0.0))
             delay = changes.get("delay", self.policy.settings.delay)
-            what = ClosedLoop(self.policy, self.phases[0].number, delay, gains)
+            execution = ClosedLoop(self.policy, self.phases[0].number, delay, gains)
         try:
-            simulation = self.simulate(changes, what, self.uncertainty.tolerance)
+            simulation = self.simulate(changes, execution, self.uncertainty.tolerance)
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
-        if not isinstance(what, ClosedLoop):
-            late = changes.get("delay", 0.0)
-            return self.judge(simulation, 0.0, [stop + late for stop in self.stops])
-        # A phase begins when its first torques take effect; the last one goes on to the end.
+        if not isinstance(execution, ClosedLoop):
+            delay = changes.get("delay", 0.0)
+            return self.judge(simulation, 0.0, [stop + delay for stop in self.stops])
+        # A phase begins when its first torques take effect; the last one lasts until the end.
         end = float(simulation.t[-1])
-        began = {number: time + what.delay for number, time in what.began.items()}
-        began[self.phases[-1].number + 1] = end
-        stops = [began.get(phase.number + 1, math.inf) for phase in self.phases]
-        return self.judge(simulation, began.get(self.phases[0].number, end), stops)
+        starts = {number: time + execution.delay for number, time in execution.phase_starts.items()}
+        starts[self.phases[-1].number + 1] = end
+        stops = [starts.get(phase.number + 1, math.inf) for phase in self.phases]
+        return self.judge(simulation, starts.get(self.phases[0].number, end), stops)
 
     def simulate(
         self,
@@ -195,7 +193,7 @@ class Trial:
         torque: TorqueProfile | ClosedLoop,
         tolerance: float = 1e-9,
     ) -> Simulation:
-        """Replay torques in the scene whose numbers are off, free of assumptions.
+        """Simulate torques in the changed scene, without prescribed contacts.
 
         InputError, SimulationError if the changed scene has no start.
         """
@@ -209,50 +207,50 @@ class Trial:
             until = torque.find_limit(self.phases[-1].number)
         return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
-    def judge(self, simulation: Simulation, began: float, stops: Sequence[float]) -> dict[str, Any]:
-        """Compare a motion, and when its phases start and stop [s], with the plan; as `run`.
+    def judge(self, simulation: Simulation, start: float, stops: Sequence[float]) -> dict[str, Any]:
+        """Compare a motion, and the times at which its phases start and stop [s], with the plan.
 
-        A phase goes on from when the last one's contact was gained to when its own is, or to its
-        end by the clock. A contact is lost that opens for longer than 1e-3 units of time. One that
-        is open at the start, which may be off, has `MOMENT` to close for good.
+        A phase lasts from the gain of the contact of the one before to the gain of its own, or to
+        its planned end. A contact is lost if it opens for longer than 1e-3 units of time. One that
+        is open at the start, which may be inexact, has `GRACE` to close. Returns as `run`.
         """
         unit, t = self.problem.scene.scales.time, simulation.t
         losses, least = list[tuple[float, int, str]](), math.inf
         for phase, planned in zip(self.phases, stops, strict=True):
             gained, aliases = list_gained(self.problem, phase), list_aliases(self.problem, phase)
-            gains = [one.start for one in simulation.stretches if one.contact in gained]
-            gain = min((time for time in gains if time > began), default=math.inf)
-            stop = min(planned, find_touch(simulation, gained, began))
+            gains = [s.start for s in simulation.stretches if s.contact in gained]
+            gain_time = min((time for time in gains if time > start), default=math.inf)
+            stop = min(planned, find_touch(simulation, gained, start))
             for name in phase.formation.names:
-                c_n = simulation.c_n[(t >= began) & (t < stop), simulation.contacts.index(name)]
+                c_n = simulation.c_n[(t >= start) & (t < stop), simulation.contacts.index(name)]
                 least = min(least, float(np.nanmin(c_n, initial=math.inf)))
-                pauses = simulation.list_pauses(name, began, stop, aliases[name])
-                closed = began + MOMENT * unit if pauses and pauses[0][0] <= began else began
+                pauses = simulation.list_pauses(name, start, stop, aliases[name])
+                settled = start + GRACE * unit if pauses and pauses[0][0] <= start else start
                 long = [pause for pause in pauses if pause[1] - pause[0] > 1e-3 * unit]
-                losses += [(first, phase.number, name) for first, after in long if after > closed]
-            began = max(planned, gain) if gained else planned
-            if began > t[-1]:
-                # What ends the whole motion may be a little short: that is for the goal to say.
+                losses += [(opened, phase.number, name) for opened, end in long if end > settled]
+            start = max(planned, gain_time) if gained else planned
+            if start > t[-1]:
+                # The last motion may end a little before its contact: the goal decides.
                 if phase is not self.phases[-1]:
                     losses.append((planned, phase.number, min(gained, default="")))
                 break
         time, number, lost = min(losses, default=(None, None, ""))
-        off = simulation.z[-1, :3] - self.goal
-        distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
-        near = distance <= self.uncertainty.find_distance(self.problem.scene)
-        near = near and angle <= self.uncertainty.angle
+        error = simulation.z[-1, :3] - self.goal
+        distance, angle = float(np.hypot(error[0], error[1])), float(abs(error[2]))
+        at_goal = distance <= self.uncertainty.find_distance(self.problem.scene)
+        at_goal = at_goal and angle <= self.uncertainty.angle
         given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
-        # Straight lines through the steps of the simulation would be seen.
-        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(simulation.z[:, :2], axis=0).T)))
-        even = np.interp(np.linspace(0.0, way[-1], 101), way, t)
-        even = even[even > 0]
-        left = np.searchsorted(t, even) - 1
+        # Smooth in figures, in which straight lines between the steps would be visible.
+        lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(simulation.z[:, :2], axis=0).T)))
+        times = np.interp(np.linspace(0.0, lengths[-1], 101), lengths, t)
+        times = times[times > 0]
+        rows = np.searchsorted(t, times) - 1
         knots = simulation.z, simulation.z_dot, simulation.z_ddot
-        path = interpolate_quintic(t[left + 1] - t[left], even - t[left], knots, left)[0]
+        path = interpolate_quintic(t[rows + 1] - t[rows], times - t[rows], knots, rows)[0]
         return {
             "distance": distance,
             "angle": angle,
-            "reached": near and not given_up,
+            "reached": at_goal and not given_up,
             "kept": not lost and not given_up,
             "lost": lost,
             "phase": number,
@@ -270,7 +268,7 @@ def make_trial(
     phase: int | None = None,
     policy: Policy | None = None,
 ) -> Trial:
-    """What is tried of a plan: all of it, or the phase of a number, by a policy if one is given.
+    """Trial of a plan, or of the phase with a number, with a policy if there is one.
 
     InputError if the plan has no phase of that number, or one that does not start at rest; or the
     policy has other phases.
@@ -288,10 +286,10 @@ def make_trial(
     if np.abs(plan.z_dot[rows[0]] / units).max() > 1e-6:
         text = f"{phase} given; it does not start at rest, so that it is no trial of its own"
         raise InputError("", "--phase", text)
-    begin = float(starts[first])
-    stops = tuple((starts[first + 1 : last + 2] - begin).tolist())
-    torque = plan.torque.cut(begin, float(starts[last + 1]))
-    torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
+    start = float(starts[first])
+    stops = tuple((starts[first + 1 : last + 2] - start).tolist())
+    torque = plan.torque.cut(start, float(starts[last + 1]))
+    torque = TorqueProfile(torque.breaks - start, torque.coefficients)
     goal = plan.q[rows[-1]]
     if policy is not None:
         policy = policy.cut(last + 1)
@@ -301,64 +299,64 @@ def make_trial(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robustness(Result):
-    """Shares of samples that reach the goal, and sensitivities of the least normal force."""
+    """Fractions of samples that reach the goal, and sensitivities of the least normal force."""
 
     trial: Trial
-    samples: Array  # (n, len(varied) + 1): as `Uncertainty.draw` gives them
+    samples: Array  # (n, len(varied) + 1): of `Uncertainty.draw`
     seed: int
-    records: tuple[dict[str, Any], ...]  # as `Trial.run` gives them, in the order of the samples
-    known: int = 0  # samples that the file has, these included; 0 without a file
+    records: tuple[dict[str, Any], ...]  # of `Trial.run`, in the order of the samples
+    known: int = 0  # number of samples in the file, these included; 0 without a file
 
     @cached_property
     def nominal(self) -> dict[str, Any]:
-        """The record without anything that is off."""
+        """The record without changes of parameters."""
         return self.trial.change({})
 
     @cached_property
     def sensitivities(self) -> Sensitivities:
-        """What the least normal force of the motion depends on; nothing with a policy."""
+        """Sensitivities of the least normal force of the motion; empty with a policy."""
         if self.trial.policy is not None:
             return Sensitivities("", math.nan, math.nan, ())
         return measure_sensitivities(self.trial)
 
     @property
     def headline(self) -> str:
-        """What it is, in a line, without the simulations that the document takes."""
+        """Counts, in a line, without the simulations that the document needs."""
         count = len(self.records)
         return f"{count} samples, goal reached {self.reached}, contacts kept {self.kept}"
 
     @property
     def reached(self) -> Share:
-        """How many reach the goal, as near as the uncertainty says."""
+        """Samples that reach the goal within the tolerances of the uncertainty."""
         return Share(sum(record["reached"] for record in self.records), len(self.records))
 
     @property
     def kept(self) -> Share:
-        """How many reach it and keep all planned contacts."""
-        good = sum(record["reached"] and record["kept"] for record in self.records)
-        return Share(good, len(self.records))
+        """Samples that reach the goal and keep all planned contacts."""
+        successes = sum(record["reached"] and record["kept"] for record in self.records)
+        return Share(successes, len(self.records))
 
     @property
     def first_lost(self) -> dict[str, Share]:
-        """Which contact goes first, by number of the phase and name, the most frequent first."""
-        lost = [(record["lost"], record.get("phase")) for record in self.records if record["lost"]]
+        """Contacts lost first, by name and number of the phase, the most frequent first."""
+        lost = [(r["lost"], r.get("phase")) for r in self.records if r["lost"]]
         names = Counter(f"{name} in phase {k}" if k is not None else name for name, k in lost)
         return {name: Share(n, len(self.records)) for name, n in names.most_common()}
 
     @property
     def document(self) -> Document:
-        """How many samples reach the goal, what is lost first, and what matters most."""
+        """Counts of samples that reach the goal, contacts lost first, sensitivities."""
         trial, count, least = self.trial, len(self.records), self.sensitivities
         phases = [phase.number for phase in trial.phases]
         place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
-        many = f"{count} of {self.known}" if self.known > count else f"{count}"
-        near = 1e3 * trial.uncertainty.find_distance(trial.problem.scene)
-        off = f"{near:.3g} mm and {math.degrees(trial.uncertainty.angle):.3g} deg"
-        shares = [(f"goal reached within {off}", str(self.reached))]
+        samples = f"{count} of {self.known}" if self.known > count else f"{count}"
+        distance = 1e3 * trial.uncertainty.find_distance(trial.problem.scene)
+        tolerances = f"{distance:.3g} mm and {math.degrees(trial.uncertainty.angle):.3g} deg"
+        shares = [(f"goal reached within {tolerances}", str(self.reached))]
         shares.append(("and all planned contacts kept", str(self.kept)))
-        lost = [(name, str(share)) for name, share in self.first_lost.items()]
+        losses = [(name, str(share)) for name, share in self.first_lost.items()]
         rest = sum(share.hits for share in list(self.first_lost.values())[8:])
-        others = [(f"{len(lost) - 8} others", f"{rest} times")] if lost[8:] else []
+        remaining = [(f"{len(losses) - 8} others", f"{rest} times")] if losses[8:] else []
         ended = Counter(record["ended"] for record in self.records if record["ended"])
         rows = []
         for sensitivity in least.of:
@@ -369,19 +367,19 @@ class Robustness(Result):
             rows.append((sensitivity.name, width, slope, sensitivity.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
         end = self.nominal
-        missed = "" if end["reached"] else str(end["ended"])
+        miss = "" if end["reached"] else str(end["ended"])
         if not end["reached"] and "distance" in end:
-            missed = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
-        place_of = f" on {least.contact} at t = {least.time:.4g} s"
+            miss = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
+        least_at = f" on {least.contact} at t = {least.time:.4g} s"
         return Document(
             f"{trial.problem.name}, {place}",
-            reason=f"{many} samples, seed {self.seed}",
+            reason=f"{samples} samples, seed {self.seed}",
             parts=[
                 Table(["", "share of the samples"], shares),
-                f"without anything off the goal is missed too: by {missed}" if missed else "",
-                Table(["contact lost first", "share of the samples"], lost[:8] + others),
+                f"without anything off the goal is missed too: by {miss}" if miss else "",
+                Table(["contact lost first", "share of the samples"], losses[:8] + remaining),
                 *(f"{count} ended early: {text}" for text, count in ended.most_common(3)),
-                f"least c_n: {least.c_n:.4g} N{place_of}" if least.contact else "",
+                f"least c_n: {least.c_n:.4g} N{least_at}" if least.contact else "",
                 Table(heads, rows),
             ],
         )
@@ -402,7 +400,7 @@ class Robustness(Result):
             "kept": self.kept.table,
             "first_lost": {name: share.table for name, share in self.first_lost.items()},
             "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
-            "sensitivities": [dict(zip(keys, one, strict=True)) for one in least.of],
+            "sensitivities": [dict(zip(keys, each, strict=True)) for each in least.of],
             "nominal": {key: entry for key, entry in self.nominal.items() if key != "path"},
         }
 
@@ -421,20 +419,19 @@ def assess_robustness(
     start: Callable[[], Executor] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Robustness:
-    """Replay a plan with numbers that are off, free of assumptions, and count what becomes of it.
+    """Free simulations of a plan with random changes of parameters, and counts of successes.
 
     Parameters
     ----------
-    samples      more than the file has add a Latin hypercube of the rest; of fewer the first are
-                 counted
+    samples      number of samples. If it exceeds that of the file, a Latin hypercube of the
+                 difference is added; otherwise the first ones of the file are counted
     seed         of the samples, a Latin hypercube of all ranges
     uncertainty  the ranges; those of the problem, or their defaults, if left out
-    phase        number of the only phase that is tried, from its planned start at rest
-    policy       what carries the plan out, by feedback from the joints
-    path         file to which results are written one by one. A study that is there already goes on
-                 where it was stopped, and ends the same to the last bit, unless it is to be
-                 `fresh`.
-    fresh        begin the file anew, whatever it holds
+    phase        number of the only phase to simulate, from its planned start at rest
+    policy       carries the plan out by feedback from the joints
+    path         file to which results are written one by one. A study in it is continued, with
+                 results that are equal to the last bit, unless `fresh` is set
+    fresh        overwrite the file
     start        makes a `concurrent.futures.Executor`; processes on all cores if left out
 
     InputError if the plan has no such phase, or the file holds another study or anything else, is
@@ -451,30 +448,30 @@ def assess_robustness(
             sizes.append(samples - sum(sizes))
             journal.add({"samples": sizes[-1]})
         outcomes = {k: record for k, record in stored.items() if k < samples}
-        # Latin hypercubes one after another: one more each time that the study is enlarged.
+        # One Latin hypercube each time that the study was enlarged.
         starts = [sum(sizes[:k]) for k in range(len(sizes))]
         seeds = [(seed, k) if k else seed for k in starts]
         cubes = [trial_uncertainty.draw(*part) for part in zip(sizes, seeds, strict=True)]
-        drawn = np.vstack(cubes)[:samples]
-        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in outcomes)
-        good = sum(record["reached"] for record in outcomes.values())
+        draws = np.vstack(cubes)[:samples]
+        tasks = ((k, tuple(draws[k].tolist())) for k in range(samples) if k not in outcomes)
+        successes = sum(record["reached"] for record in outcomes.values())
         for (number, _), answer in run_all(trial.run, tasks, (start or Processes)()):
             if isinstance(answer, DiedError):
                 answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
             elif isinstance(answer, Exception):
                 raise answer
             outcomes[number] = {"sample": number, **answer}
-            good += answer["reached"]
+            successes += answer["reached"]
             journal.add(outcomes[number])
             if progress is not None:
-                progress(f"{len(outcomes)} of {samples} samples, {good} reach the goal")
+                progress(f"{len(outcomes)} of {samples} samples, {successes} reach the goal")
     records = tuple(outcomes[number] for number in range(samples))
-    known_now = 0 if path is None else len({*stored, *outcomes})
-    return Robustness(trial, drawn, seed, records, known_now)
+    n_stored = 0 if path is None else len({*stored, *outcomes})
+    return Robustness(trial, draws, seed, records, n_stored)
 
 
 def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
-    """What records belong to: another plan, range or version makes them another study's."""
+    """Inputs of a study: records of other plans, ranges or versions are of another study."""
     policy = trial.policy
     arrays = [] if policy is None else [array for t in policy.tables for array in t.values()]
     return {
@@ -500,7 +497,7 @@ def _digest(arrays: Iterable[Array]) -> str:
 
 
 class Sensitivity(NamedTuple):
-    """Of one normal force, by central differences of free simulations."""
+    """Sensitivity of a normal force, by central differences of free simulations."""
 
     name: str  # name, unit: the parameter, and the unit of its range; empty for a relative one
     unit: str
@@ -510,15 +507,15 @@ class Sensitivity(NamedTuple):
 
     @property
     def over_range(self) -> float:
-        """What the half width changes, to first order [N]."""
+        """Change by the half width, to first order [N]."""
         return self.slope * self.width
 
 
 class Sensitivities(NamedTuple):
-    """The least normal force of a motion, and what it depends on."""
+    """The least normal force of a motion, and its sensitivities."""
 
     contact: str
-    time: float  # [s]: when it is least, away from where forces step
+    time: float  # [s]: of the least force, without times near steps of forces
     c_n: float  # [N]
     of: tuple[Sensitivity, ...]  # the largest over its range first
 
@@ -526,40 +523,40 @@ class Sensitivities(NamedTuple):
 def measure_sensitivities(trial: Trial) -> Sensitivities:
     """Sensitivities of the least planned normal force to every parameter with a range.
 
-    The least value of a smooth force changes like the force where it is least, whenever that is.
+    To first order, the least value of a smooth force changes like the force at that instant.
     """
     least, contact, time = find_least(trial)
     sensitivities = []
     for parameter in trial.uncertainty.varied if contact else ():
         width = trial.uncertainty.widths[parameter.name]
         step = 1e-3 * width
-        ends = (0.0, step) if parameter.name == "delay" else (-step, step)
+        values = (0.0, step) if parameter.name == "delay" else (-step, step)
         forces = list[float]()
-        for value in ends:
-            change, late = {parameter.name: value}, value if parameter.name == "delay" else 0.0
-            torque = change_torques(trial.torque, change).cut(0.0, time + late)
+        for value in values:
+            change, delay = {parameter.name: value}, value if parameter.name == "delay" else 0.0
+            torque = change_torques(trial.torque, change).cut(0.0, time + delay)
             try:
                 simulation = trial.simulate(change, torque)
                 forces.append(float(simulation.c_n[-1, simulation.contacts.index(contact)]))
             except (InputError, SimulationError):
                 forces.append(math.nan)
-        slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
+        slope = (forces[1] - forces[0]) / (values[1] - values[0])
         sensitivities.append(Sensitivity(parameter.name, parameter.unit, width, slope))
-    sensitivities.sort(key=lambda one: np.nan_to_num(-abs(one.over_range), nan=math.inf))
+    sensitivities.sort(key=lambda s: np.nan_to_num(-abs(s.over_range), nan=math.inf))
     return Sensitivities(contact, time, least, tuple(sensitivities))
 
 
 def find_least(trial: Trial) -> tuple[float, str, float]:
-    """The least c_n of a planned contact [N], which, and when [s]; NaN and no name for none."""
+    """The least c_n of a planned contact [N], its name and time [s]; NaN and "" for none."""
     simulation, start = trial.simulate({}, trial.torque), 0.0
     t, forces = simulation.t, list[tuple[float, str, float]]()
     events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])
-    # Where a contact slides the other way forces step, at another time when numbers are off.
-    apart = np.abs(t[:, None] - events).min(axis=1) > 0.01 * t[-1]
+    # Forces step where sliding reverses, and changes of parameters shift the time of the step.
+    smooth = np.abs(t[:, None] - events).min(axis=1) > 0.01 * t[-1]
     for phase, stop in zip(trial.phases, trial.stops, strict=True):
         for name in phase.formation.names:
             c_n = simulation.c_n[:, simulation.contacts.index(name)]
-            rows = np.flatnonzero(apart & (t > start) & (t < stop) & (c_n == c_n))
+            rows = np.flatnonzero(smooth & (t > start) & (t < stop) & (c_n == c_n))
             forces += [(float(c_n[row]), name, float(t[row])) for row in rows]
         start = stop
     return min(forces, key=lambda force: force[0], default=(math.nan, "", math.nan))
@@ -567,7 +564,7 @@ def find_least(trial: Trial) -> tuple[float, str, float]:
 
 @dataclass(frozen=True)
 class Share:
-    """How many of how many, with Wilson's interval of 95 % for the probability.
+    """Fraction of samples, with Wilson's interval of 95 % for the probability.
 
     References
     ----------
@@ -589,12 +586,12 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share itself; NaN of none."""
+        """The fraction; NaN without samples."""
         return self.hits / self.total if self.total else math.nan
 
     @property
     def table(self) -> dict[str, float]:
-        """All of it, as JSON has it."""
+        """Count, fraction and interval, as in JSON."""
         low, high = self.interval
         return {"count": self.hits, "share": self.value, "low": low, "high": high}
 

@@ -1,7 +1,7 @@
 """Speeds up to which motions along the paths of phases keep every contact, without planning.
 
 Inverse dynamics along a path at given s' and s''; the internal force is the best one at each place,
-or that of quasistatic torques. Breaks are found by bisection over the speed.
+or that of quasistatic torques. Limit speeds are found by bisection.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from ..problem.definition import End, Phase, Problem
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile
 
-PLACES = 241  # about how many places of a phase are looked at
+N_PLACES = 241  # approximate number of places of a phase
 SQUEEZE = 0.5
 """Internal force of quasistatic torques: 0 least, 1 with the largest least normal force."""
-OWN = "own torques"  # name of the motion under the torques of the quasistatic one
+OWN_TORQUES = "own torques"  # name of the motion under the torques of the quasistatic one
 PROFILES: dict[str, tuple[tuple[float, ...], float]] = {
     "steady": ((1.0,), 1.0),
     "moving": ((1.0,), 1.0),
@@ -60,39 +60,37 @@ rest s'' is constant, with none the speed is."""
 def predict(
     problem: Problem, *, squeeze: float = SQUEEZE, progress: Callable[[str], None] | None = None
 ) -> Prediction:
-    """Predict quasistatic motions along the phases of a problem, and at which speed they break.
+    """Quasistatic motions along the phases of a problem, and the speeds up to which contacts hold.
 
     Parameters
     ----------
-    squeeze   internal force of quasistatic torques, from 0, the least torques that keep epsilon, to
-              1, those with which what presses least in the phase presses most. They are the least
-              torques that keep a normal force that far between.
-    progress  called with the phase that is predicted
+    squeeze   internal force of quasistatic torques. They are the least torques that keep a normal
+              force, interpolated from epsilon, at 0, to the largest least one of the phase, at 1
+    progress  called with a text before each phase
 
     InputError if the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
-    share = SHARE.read(squeeze, "squeeze")
+    ratio = SHARE.read(squeeze, "squeeze")
     predictions: list[PhasePrediction] = []
-    z, moving = problem.start, False
+    z, in_motion = problem.start, False
     with name_source(problem.source):
         for phase in problem.phases:
             if progress is not None:
                 progress(f"predicting phase {phase.number} of {len(problem.phases)}")
             later = problem.phases[phase.index + 1 :]
             path = sample_path(phase, z, later)
-            rests = not moving, phase.end is End.REST
-            predictions.append(_predict_phase(problem, phase, path, rests, share))
+            at_rest = not in_motion, phase.end is End.REST
+            predictions.append(_predict_phase(problem, phase, path, at_rest, ratio))
             z = find_end(phase, z, later) if path is None else path.point.z[-1]
-            moving = phase.end is not End.REST
+            in_motion = phase.end is not End.REST
     return Prediction(problem.name, problem.epsilon, tuple(predictions))
 
 
 def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
-    """Quasistatic torques of all phases over time, as if each were run through at a mean speed.
+    """Quasistatic torques of all phases over time, at a constant speed along the phases [m/s].
 
-    They balance friction, and set nothing in motion: hand tuning starts from there. The mean speed
-    is along the phases [m/s].
+    They balance friction without starting a motion: the first guess of hand tuning.
 
     InfeasibleError if a phase has no quasistatic torques.
     """
@@ -107,36 +105,36 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
 
 def _predict_phase(
-    problem: Problem, phase: Phase, path: PathSamples | None, rests: tuple[bool, bool], share: float
+    problem: Problem, phase: Phase, path: PathSamples | None, rest: tuple[bool, bool], ratio: float
 ) -> PhasePrediction:
     names, until = phase.formation.names, str(phase.until)
     if path is None:
         return PhasePrediction(phase.number, names, until, "left out", math.nan)
-    motion_name = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
+    motion_name = ("moving", "to rest", "from rest", "rest to rest")[2 * rest[0] + rest[1]]
     motions = {
         name: (evaluate_best(path, name), PROFILES[name][1] * path.length)
         for name in ("steady", motion_name)
     }
-    torques = find_torques(path, problem.epsilon, share)
+    torques = find_torques(path, problem.epsilon, ratio)
     if torques is not None:
-        motions[OWN] = (evaluate_torques(path, torques.tau), path.length)
+        motions[OWN_TORQUES] = (evaluate_torques(path, torques.tau), path.length)
         # Every eighth place, with both ends and both sides of every reversal.
-        same = np.diff(path.s) == 0
-        chosen = np.append(True, same) | np.append(same, True)
+        reversals = np.diff(path.s) == 0
+        chosen = np.append(True, reversals) | np.append(reversals, True)
         chosen[::8] = True
         torques = QuasistaticTorques(*(part[chosen] for part in torques))
-    unit, survivals = problem.scene.scales.speed, list[Survival]()
-    for name, (evaluate, way) in motions.items():
-        speed, again, least = find_break(evaluate, problem.epsilon, unit)
-        lost, *_ = find_break(evaluate, 0.0, unit, speed or 0.0)
-        duration = way / speed if speed else None
-        survivals.append(Survival(name, speed, duration, lost, again, _name(path, least)))
+    unit, survivals = problem.scene.scales.speed, list[LimitSpeeds]()
+    for name, (evaluate, path_length) in motions.items():
+        speed, again, least = find_limit_speed(evaluate, problem.epsilon, unit)
+        lost, *_ = find_limit_speed(evaluate, 0.0, unit, speed or 0.0)
+        duration = path_length / speed if speed else None
+        survivals.append(LimitSpeeds(name, speed, duration, lost, again, _name(path, least)))
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
-    held = (grasp.least >= problem.epsilon) & (path.inertia > 0)
-    # Least forces are drawn about the speeds at which something breaks.
-    every = [s for one in survivals for s in (one.speed, one.lost, one.again) if s]
-    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
+    kept = (grasp.least >= problem.epsilon) & (path.inertia > 0)
+    # Curves of least forces extend over all limit speeds.
+    limits = [s for each in survivals for s in (each.speed, each.lost, each.again) if s]
+    ends = (0.36 * min(limits), 1.4 * max(limits)) if limits else (0.1 * unit, 10 * unit)
     speeds = np.geomspace(*ends, 61)
     forces = {
         name: np.array([evaluate(speed).force for speed in speeds.tolist()])
@@ -149,37 +147,37 @@ def _predict_phase(
         path="line" if path.curve is None else "curve",
         length=path.length,
         slow=_name(path, motions["steady"][0](0.0)),
-        kept=tuple((_place(path, r.start), _place(path, r.stop - 1)) for r in find_runs(held)),
+        kept=tuple((_place(path, r.start), _place(path, r.stop - 1)) for r in find_runs(kept)),
         survivals=tuple(survivals),
         torques=torques,
         curves=Curves(speeds, forces),
     )
 
 
-def find_torques(path: PathSamples, epsilon: float, share: float) -> QuasistaticTorques | None:
-    """Torques that balance a quasistatic motion at all places of a path; None if some have none.
+def find_torques(path: PathSamples, epsilon: float, squeeze: float) -> QuasistaticTorques | None:
+    """Torques that balance a quasistatic motion at all places of a path; None if impossible.
 
-    They keep `epsilon` [N], with a `share` of the internal force as of `predict`.
+    They keep `epsilon` [N]; `squeeze` is that of `predict`.
     """
     zero = np.zeros_like(path.s)
     best = path.force_limits.find_best(zero, zero)
     if not (best.least >= epsilon).all() or not (path.inertia > 0).all():
         return None
-    wanted = epsilon + share * float(best.least.min() - epsilon)
-    low, high = path.force_limits.find_span(zero, zero, wanted)
+    required = epsilon + squeeze * float(best.least.min() - epsilon)
+    low, high = path.force_limits.find_span(zero, zero, required)
     forces = path.forces
-    level, press = (forces.of_tau[..., column] for column in (ONE, LAMBDA))
-    size = (press**2).sum(axis=1)
+    constant, by_lambda = (forces.of_tau[..., column] for column in (ONE, LAMBDA))
+    size = (by_lambda**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        lightest = -(level * press).sum(axis=1) / size
-    # At the largest least force the span is one point, but for rounding.
-    middle = np.where(low <= high, np.clip(lightest, low, high), best.internal_force)
-    internal = np.where(size > 0, middle, 0.0)
+        minimal = -(constant * by_lambda).sum(axis=1) / size
+    # At the largest least force the interval is one point, but for rounding.
+    clipped = np.where(low <= high, np.clip(minimal, low, high), best.internal_force)
+    internal = np.where(size > 0, clipped, 0.0)
     c_n = forces.c(zero, zero, internal)[:, : path.phase.formation.n_contacts]
     return QuasistaticTorques(path.s, path.point.z, forces.tau(zero, zero, internal), c_n)
 
 
-def _name(path: PathSamples, least: Least) -> Weakest:
+def _name(path: PathSamples, least: Least) -> CriticalLimits:
     parts = dict[str, dict[str, None]]()  # contacts, and others by kind of limit
     for limit in (path.force_limits.limits.limits[k] for k in least.limits):
         kind = "" if limit.kind in (PRESS, CONE) else limit.kind
@@ -187,7 +185,7 @@ def _name(path: PathSamples, least: Least) -> Weakest:
     contacts = tuple(parts.pop("", {}))
     others = tuple(f"{kind} of {' and '.join(each)}" for kind, each in parts.items())
     force = least.force if math.isfinite(least.force) else None
-    return Weakest(contacts, others, _place(path, least.place), force)
+    return CriticalLimits(contacts, others, _place(path, least.place), force)
 
 
 def _place(path: PathSamples, row: int) -> Place:
@@ -197,20 +195,20 @@ def _place(path: PathSamples, row: int) -> Place:
 class Least(NamedTuple):
     """Least normal force along a phase at one speed."""
 
-    # [N]: the least normal force, or for a rolling contact the epsilon that its cone leaves; minus
-    # infinity where other limits are missed with any internal force
+    # [N]: the least normal force, or for a rolling contact the largest epsilon within its cone;
+    # minus infinity where other limits are violated with any internal force
     force: float
     place: int  # row of the path
-    limits: tuple[int, ...]  # what keeps it from being more, as indices into the limits of the path
+    limits: tuple[int, ...]  # active limits, as indices into the limits of the path
 
 
-Evaluate = Callable[[float], Least]  # what presses least at a speed [m/s]
+Evaluate = Callable[[float], Least]  # least normal force at a speed [m/s]
 
 
 def evaluate_best(path: PathSamples, profile: str) -> Evaluate:
-    """Least normal force along a path by the largest speed of one of `PROFILES`.
+    """Least normal force along a path as a function of the largest speed of one of `PROFILES`.
 
-    With the best internal force at each place.
+    The internal force is the best one at each place.
     """
     square, x = Polynomial(PROFILES[profile][0]), path.s / path.length
     a, b = square.deriv()(x) / (2 * path.length), square(x)
@@ -226,58 +224,58 @@ def evaluate_best(path: PathSamples, profile: str) -> Evaluate:
 
 
 def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
-    """Least normal force by a steady speed, under given torques, shape (n, 2) [N m]."""
+    """Least normal force as a function of a constant speed, under torques `tau` (n, 2) [N m]."""
     limits = path.force_limits.limits
-    owners, soft = limits.owners, limits.of(PRESS, CONE)
-    weights = np.concatenate([limit.weight for limit in limits.limits])[soft]
-    others = np.setdiff1d(np.arange(len(owners)), soft)
-    # Torques that keep a limit to rounding keep it.
+    owners, force_limits = limits.owners, limits.of(PRESS, CONE)
+    weights = np.concatenate([limit.weight for limit in limits.limits])[force_limits]
+    others = np.setdiff1d(np.arange(len(owners)), force_limits)
+    # Tolerance for rounding.
     slack = 1e-9 * limits.scales[others]
 
     def evaluate(speed: float) -> Least:
         rates = speed * path.point.z_s[:, 3:]
-        values = np.hstack([path.press_under(tau, speed), tau, rates]) @ limits.rows.T
-        force, rest = values[:, soft] / weights, values[:, others]
-        over = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
-        force[over.any(axis=1)] = -np.inf
+        values = np.hstack([path.find_forces(tau, speed), tau, rates]) @ limits.rows.T
+        force, rest = values[:, force_limits] / weights, values[:, others]
+        violated = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
+        force[violated.any(axis=1)] = -np.inf
         place, row = np.unravel_index(int(force.argmin()), force.shape)
-        return Least(float(force[place, row]), int(place), (int(owners[soft[row]]),))
+        return Least(float(force[place, row]), int(place), (int(owners[force_limits[row]]),))
 
     return evaluate
 
 
-def find_break(
-    evaluate: Evaluate, wanted: float, unit: float, above: float = 0.0
+def find_limit_speed(
+    evaluate: Evaluate, required: float, unit: float, above: float = 0.0
 ) -> tuple[float | None, float | None, Least]:
-    """The least speed at which less than a `wanted` force [N] is left, by bisection.
+    """The least speed at which the least force is below `required` [N], by bisection.
 
-    Up to the speed `above` [m/s] more than the `wanted` force [N] is known to be left, if it is at
-    rest; `unit` is the scene's speed [m/s].
+    At speeds up to `above` [m/s] the force is known to be enough if it is enough at rest; `unit` is
+    the scene's speed [m/s].
 
     Returns
     -------
-    speed : [m/s]  zero where less is left near rest, None where no speed leaves less
-    again : [m/s]  where that is zero, the speed from which on enough is left; None if there is none
-    least          what presses least just above the speed
+    speed : [m/s]  zero if the force is below near rest, None if it is enough at all speeds
+    again : [m/s]  if `speed` is zero, the speed above which the force is enough; None without one
+    least          the least force just above the speed
     """
     start, low = evaluate(0.0), above
-    holds = start.force >= wanted
+    enough = start.force >= required
     speeds = unit * np.geomspace(1e-2, 1e2, 49)
     for high in speeds[speeds > above].tolist():
         least = evaluate(high)
-        if (least.force >= wanted) != holds:
+        if (least.force >= required) != enough:
             break
         low = high
     else:
-        return (None if holds else 0.0), None, start
+        return (None if enough else 0.0), None, start
     for _ in range(24):
-        middle = (low + high) / 2
-        sample = evaluate(middle)
-        if (sample.force >= wanted) == holds:
-            low = middle
+        speed = (low + high) / 2
+        candidate = evaluate(speed)
+        if (candidate.force >= required) == enough:
+            low = speed
         else:
-            high, least = middle, sample
-    return (high, None, least) if holds else (0.0, high, start)
+            high, least = speed, candidate
+    return (high, None, least) if enough else (0.0, high, start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,8 +284,7 @@ class PathSamples:
 
     phase: Phase
     curve: Curve | None  # none along a straight line
-    # (n,) [m]: arc lengths in the metric of curves; where a direction reverses a place is there
-    # twice
+    # (n,) [m]: arc lengths in the metric of curves; places of reversals occur twice
     s: Array
     point: CurvePoint
     directions: Directions  # one row for each place
@@ -301,14 +298,14 @@ class PathSamples:
         """Length of the phase [m]."""
         return float(self.s[-1])
 
-    def press_under(self, tau: Array, speed: float) -> Array:
-        """Contact forces [c_n; c_t(rolling)] under torques `tau`, (n, 2), at a speed, (n, n_c + R).
+    def find_forces(self, tau: Array, speed: float) -> Array:
+        """Contact forces [c_n; c_t(rolling)], (n, n_c + R), under torques `tau` (n, 2) at a speed.
 
-        Whatever acceleration these give.
+        The acceleration follows from the torques.
         """
-        at, v = self.point.kinematics, speed * self.point.z_s
-        at = at._replace(P_dot_v=speed**2 * at.P_dot_v)
-        return forward(self.phase.formation, at, v, tau, self.directions)[1]
+        kinematics, v = self.point.kinematics, speed * self.point.z_s
+        kinematics = kinematics._replace(P_dot_v=speed**2 * kinematics.P_dot_v)
+        return forward(self.phase.formation, kinematics, v, tau, self.directions)[1]
 
 
 def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples | None:
@@ -324,11 +321,11 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
             curve = replace(curve, length=RELEASE_AT * curve.length)
         # Both ends of each segment, and denser there, where motions start and stop.
         sizes = [part.stop - part.start for part in curve.segments]
-        counts = [max(5, round(PLACES * size / curve.length)) for size in sizes]
-        shares = [(1 - np.cos(np.linspace(0.0, np.pi, count))) / 2 for count in counts]
+        counts = [max(5, round(N_PLACES * size / curve.length)) for size in sizes]
+        fractions = [(1 - np.cos(np.linspace(0.0, np.pi, count))) / 2 for count in counts]
         owners = np.repeat(np.arange(len(counts)), counts)
         starts = np.array([part.start for part in curve.segments])
-        s = starts[owners] + np.concatenate(shares) * np.array(sizes)[owners]
+        s = starts[owners] + np.concatenate(fractions) * np.array(sizes)[owners]
         point = curve.evaluate(s)
         directions = directions_of(curve, owners)
     elif formation.n_constraints == 3 and count_freedoms(formation, z) == 2:
@@ -345,24 +342,25 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
 
 def _straighten(formation: Formation, start: Array, goal: Array) -> tuple[Array, CurvePoint]:
     """Arc lengths of places along a straight line in (x, phi), and the path there."""
-    u = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
-    way = goal - start
-    line, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
+    u = (1 - np.cos(np.linspace(0.0, np.pi, N_PLACES))) / 2
+    line_z = goal - start
+    line, slip = start + u[:, None] * line_z, formation.evaluate_slip(start[None])[0]
     z = close_all(formation, line, slip, ((0, line[:, 0]), (2, line[:, 2])))
-    metric, along = metric_weights(formation.scene), way * [1, 0, 1, 0, 0]
-    at, across = formation.evaluate(z, np.zeros_like(z)), np.array([-way[2], 0, way[0], 0, 0])
+    metric, tangent = metric_weights(formation.scene), line_z * [1, 0, 1, 0, 0]
+    at = formation.evaluate(z, np.zeros_like(z))
+    normal = np.array([-line_z[2], 0, line_z[0], 0, 0])
     for _ in range(2):
-        # The line is one more constraint; it has no curvature of its own.
-        P, bend = border(at.P, across), np.pad(at.P_dot_v, ((0, 0), (0, 1)))
-        z_s, z_ss = solve_tangent(P, bend, np.tile(along, (PLACES, 1)), metric)
+        # The line is one more constraint, without curvature.
+        P, curvature = border(at.P, normal), np.pad(at.P_dot_v, ((0, 0), (0, 1)))
+        z_s, z_ss = solve_tangent(P, curvature, np.tile(tangent, (N_PLACES, 1)), metric)
         at = formation.evaluate(z, z_s)
-    speed = along @ along / (z_s @ along)
+    speed = tangent @ tangent / (z_s @ tangent)
     s = np.append(0.0, np.cumsum(np.diff(u) * (speed[1:] + speed[:-1]) / 2))
     return s, CurvePoint(z, z_s, z_ss, at)
 
 
 class Place(NamedTuple):
-    """Where along a phase: arc length [m], x [m] and phi [rad]."""
+    """A place along a phase: arc length [m], x [m] and phi [rad]."""
 
     s: float
     x: float
@@ -373,14 +371,14 @@ class Place(NamedTuple):
         return describe_pose(np.array(self[1:]))
 
 
-class Weakest(NamedTuple):
-    """The limits that are missed first, and where."""
+class CriticalLimits(NamedTuple):
+    """The limits that are violated first, and their place."""
 
-    # one, or two of which either does with another internal force; none where it is no contact
+    # one, or two of which the internal force selects one; none if other limits are the first
     contacts: tuple[str, ...]
-    others: tuple[str, ...]  # torques or speeds of fingers that keep it from pressing more
+    others: tuple[str, ...]  # active limits of torques or speeds of fingers
     place: Place
-    # [N]: the least normal force there; None where other limits than those of forces are missed
+    # [N]: the least normal force there; None if limits other than those of forces are violated
     force: float | None
 
     @property
@@ -390,21 +388,21 @@ class Weakest(NamedTuple):
         return ", by ".join(filter(None, parts)) or "jams"
 
 
-class Survival(NamedTuple):
-    """Up to which speed one kind of motion keeps every contact."""
+class LimitSpeeds(NamedTuple):
+    """Limit speeds of one kind of motion."""
 
-    # "steady": at one speed, with the best internal force at each place; "rest to rest",
-    # "from rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own
-    # torques": at one speed, under the torques of the quasistatic motion
+    # "steady": constant speed, with the best internal force at each place; "rest to rest",
+    # "from rest", "to rest": with the best one, too, s a cosine of time, or constant acceleration;
+    # "own torques": constant speed, under the torques of the quasistatic motion
     motion: str
-    # [m/s]: along the phase, its largest, from which on a contact presses with less than epsilon.
-    # Zero where one does near rest, None where none does.
+    # [m/s]: least peak speed along the phase at which a normal force is below epsilon. Zero if one
+    # is near rest, None if none is at any speed.
     speed: float | None
     duration: float | None  # [s]: of the phase at that speed
-    lost: float | None  # [m/s]: likewise, from which on a contact is lost
-    # [m/s]: where that is zero, the speed from which on contacts are kept after all
+    lost: float | None  # [m/s]: least peak speed at which a contact is lost
+    # [m/s]: if `speed` is zero, the speed above which all contacts are kept
     again: float | None
-    first: Weakest  # what gives way at `speed`
+    first: CriticalLimits  # the limits that are violated at `speed`
 
 
 class QuasistaticTorques(NamedTuple):
@@ -420,7 +418,7 @@ class Curves(NamedTuple):
     """The least normal force over speed."""
 
     speed: Array  # (n,) [m/s]
-    # (n,) [N]: by the names of motions; minus infinity where other limits are missed
+    # (n,) [N]: by the names of motions; minus infinity where other limits are violated
     force: dict[str, Array]
 
 
@@ -431,16 +429,15 @@ class PhasePrediction:
     number: int
     contacts: tuple[str, ...]
     until: str
-    # {"curve", "line", "left out"}: whether it is looked at along its curve, or along a straight
-    # line in (x, phi)
+    # {"curve", "line", "left out"}: its curve, a straight line in (x, phi), or no prediction
     path: str
     length: float  # [m]
-    # what presses least in the quasistatic motion with the best internal force; None if left out
-    slow: Weakest | None = None
+    # least force of the quasistatic motion with the best internal force; None if left out
+    slow: CriticalLimits | None = None
     # stretches where the quasistatic motion keeps every contact
     kept: tuple[tuple[Place, Place], ...] = ()
-    survivals: tuple[Survival, ...] = ()
-    torques: QuasistaticTorques | None = None  # none where torques do not balance everywhere
+    survivals: tuple[LimitSpeeds, ...] = ()
+    torques: QuasistaticTorques | None = None  # None if no torques balance everywhere
     curves: Curves | None = None
 
     derived = ("is_kept",)
@@ -453,7 +450,7 @@ class PhasePrediction:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Result):
-    """What is predicted of a problem."""
+    """Predictions of the phases of a problem."""
 
     name: str
     epsilon: float  # [N]
@@ -461,11 +458,11 @@ class Prediction(Result):
 
     @property
     def document(self) -> Document:
-        """Tables of quasistatic motions, and of the speeds at which they break."""
-        bad = [phase.number for phase in self.phases if phase.slow and not phase.is_kept]
+        """Tables of quasistatic motions and of limit speeds."""
+        failed = [phase.number for phase in self.phases if phase.slow and not phase.is_kept]
         verdict = "keeps every contact"
-        if bad:
-            verdict += f" but in phase{'s' * (len(bad) > 1)} {', '.join(map(str, bad))}"
+        if failed:
+            verdict += f" but in phase{'s' * (len(failed) > 1)} {', '.join(map(str, failed))}"
         head = f"a quasistatic motion, epsilon = {self.epsilon:g} N, {verdict}"
         if all(phase.path == "left out" for phase in self.phases):
             head = "no phase has one or two freedoms"

@@ -1,4 +1,4 @@
-"""Torques from rest to rest by trial and error in steps of 10 %.
+"""Torques from rest to rest, tuned in steps of 10 % by simulation.
 
 Constant torques of a phase start from quasistatic ones. The acting torque is raised until the end
 is reached; the instant of a brake is found by false position in the arrival speed.
@@ -32,35 +32,35 @@ from ..verification import free
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
 FACTOR = 1.1
-"""What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
+"""Factor that raises a torque by 10 %; lowering divides by it, so that values repeat."""
 
 
 @dataclass(frozen=True)
 class TuningSettings:
     """Accuracies and limits of the search; times and speeds are over those of the scene."""
 
-    lasts: float = 40.0  # how long a trial goes on after its last step of the torques
-    pause: float = 0.2  # how long the object is held at the end of each phase
-    back: float = 1e-6  # increase of the distance from the end, over the way, that is turning back
-    # Speed at which a brake may reach the end: contacts part for less than a moment then.
+    trial_time: float = 40.0  # duration of a trial after its last step of the torques
+    pause: float = 0.2  # time for which the object is held at the end of each phase
+    back: float = 1e-6  # increase of the distance, over the path, that counts as turning back
+    # Largest speed of arrival with a brake: impacts then open contacts for a negligible time.
     slow: float = 3e-5
-    coarse: float = 50.0  # factor on that while brakes are compared
-    raises: int = 60  # most times a torque is raised or lowered: a factor of 300
-    brake_step: int = 2  # by how many steps the acting torque is lowered while it brakes too little
-    gain: float = 0.02  # least share of the time by which another 10 % brings the end sooner
-    failures: int = 2  # torques that stop nothing after which the search ends, once one has
-    trials: int = 24  # most trials that look for the instant to brake
-    losses: int = 4  # most of them that may lose a contact
-    # Bracket of that instant, over its time, at which the end is either reached fast (over the
-    # drive's speed) or missed by far (over the way): when to brake does not matter then.
+    coarse: float = 50.0  # factor on that speed while brakes are compared
+    raises: int = 60  # largest number of raises or lowerings of a torque: a factor of 300
+    brake_step: int = 2  # steps by which the acting torque is lowered while it brakes too little
+    gain: float = 0.02  # least relative reduction of the duration by another step of the brake
+    failures: int = 2  # failed torques after a successful one with which the search ends
+    max_trials: int = 24  # most trials in the search for the instant of the brake
+    max_losses: int = 4  # most of them that may lose a contact
+    # Bracket of that instant, over its time, below which the search ends if the arrival is fast
+    # (over the drive's speed) or the distance large (over the path): the instant has no effect.
     bracket: float = 1e-3
     fast: float = 0.1
     far: float = 0.02
-    grid: int = 16  # instants to brake at that are tried, where all let the object arrive
-    sections: int = 45  # most golden sections to the one at which it arrives most slowly
-    hold: int = 6  # how many times the acting torque is lowered to hold the end, less one
-    simulations: int = 600  # of one start, after which nothing further is tried
-    stops: int = 7  # most stops of a phase: halves of halves of halves
+    n_grid: int = 16  # instants of the brake on a grid, if the object arrives with all of them
+    n_sections: int = 45  # most steps of golden-section search for the slowest arrival
+    holds: int = 6  # lowerings of the acting torque to hold the end, plus one
+    max_simulations: int = 600  # largest number for one start
+    max_stops: int = 7  # most stops of a phase: three bisections
 
 
 SETTINGS = TuningSettings()
@@ -72,12 +72,12 @@ class TrialOutcome(Enum):
     RESTS = "rests"
     """The object does not begin to slide, stops short of the end of the phase, or turns back."""
     ARRIVES = "arrives"  # the end of the phase is reached
-    LOSES = "loses"  # a contact parts, or presses with less than epsilon
-    LASTS = "lasts"  # the object is still on its way when the trial is over
+    LOSES = "loses"  # a contact opens, or presses with less than epsilon
+    LASTS = "lasts"  # the object still moves at the end of the trial
 
 
 class TuningStep(NamedTuple):
-    """Torques that hold from an instant on."""
+    """Torques that are constant from an instant on."""
 
     time: float  # [s]: since the start of the phase, or of all
     tau: tuple[float, float]  # [N m]
@@ -88,16 +88,15 @@ class TuningTrial(NamedTuple):
 
     steps: tuple[TuningStep, ...]  # the torques
     outcome: TrialOutcome
-    time: float  # [s]: when it came to that, since the start of the phase
-    contact: str  # the one that is lost, empty if none is
-    rate: float  # [m/s or rad/s]: how fast the end of the phase closes at that time
-    slowing: float  # [m/s^2 or rad/s^2]: by how much that becomes less then
-    # [m or rad]: how far away the end was when it was nearest; infinite before the last of several
-    # phases
+    time: float  # [s]: of the outcome, since the start of the phase
+    contact: str  # the lost contact, or empty
+    rate: float  # [m/s or rad/s]: closing speed of the end of the phase at that time
+    slowing: float  # [m/s^2 or rad/s^2]: deceleration of the closing speed at that time
+    # [m or rad]: least distance from the end; infinite before the last of several phases
     short: float
-    least: float  # [N]: the least normal force until then, of `weakest`; infinite if nothing moved
+    least: float  # [N]: least normal force until then, of `weakest`; infinite if nothing moved
     weakest: str
-    z: Array  # (5,): where it was then
+    z: Array  # (5,): configuration at that time
 
     def to_text(self) -> str:
         """The outcome in words."""
@@ -118,57 +117,56 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
 
 
 class Passage(NamedTuple):
-    """Phases that are carried in one motion."""
+    """Phases that pass into one another in motion."""
 
     phases: tuple[Phase, ...]
-    after: Phase | None  # the one that follows; None after the last
+    following: Phase | None  # the next phase; None after the last
 
 
 def split_passages(problem: Problem) -> list[Passage]:
-    """The phases of a problem, those together that are carried in one motion."""
+    """The phases of a problem, grouped into passages."""
     passages: list[Passage] = []
     phases: list[Phase] = []
-    for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
+    for phase, following in zip(problem.phases, (*problem.phases[1:], None), strict=True):
         phases.append(phase)
-        # A contact that goes on as the one which ends the phase is carried on in motion.
+        # A contact that only changes its name at the end of the phase does not stop the motion.
         contact = phase.until.contact
-        moves = contact is not None and contact.name not in free.list_gained(problem, phase)
-        if after is None or (phase.end is End.REST and not moves):
-            passages.append(Passage(tuple(phases), after))
+        passes = contact is not None and contact.name not in free.list_gained(problem, phase)
+        if following is None or (phase.end is End.REST and not passes):
+            passages.append(Passage(tuple(phases), following))
             phases = []
     return passages
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseTuning:
-    """One phase, or several that are carried in one motion."""
+    """Tuning of a passage: one phase, or several that pass into one another in motion."""
 
-    number: int  # number, last: the first phase's and the last one's
+    number: int  # number, last: of the first and the last phase
     last: int
     until: str
     acting: int = 0  # number of the finger behind the motion; 0 if the phase was not tuned
-    # [N m]: torques that balance the slow motion at its start: both torques are these in steps of
-    # 10 %
+    # [N m]: torques of the quasistatic motion at the start, which are changed in steps of 10 %
     quasistatic: tuple[float, float] = (math.nan, math.nan)
-    # how many times the acting torque was raised to drive the object; None if that did not help
+    # number of raises of the acting torque that drives the object; None if none succeeds
     raised: int | None = None
-    braked: int | None = None  # likewise while braking, lowered if negative; None without a brake
-    # how many times the supporting torque is raised while braking, lowered if negative
+    braked: int | None = None  # raises in the brake, negative if lowered; None without a brake
+    # raises of the supporting torque in the brake, negative if lowered
     supported: int = 0
-    # the torques, since the start of the phase, the last ones holding the object at its end
+    # the torques, since the start of the phase; the last ones hold the object at its end
     steps: tuple[TuningStep, ...] = ()
     duration: float = math.nan  # [s]: until its end is reached
-    rate: float = math.nan  # [m/s or rad/s]: how fast that closes then
+    rate: float = math.nan  # [m/s or rad/s]: closing speed of the end at that time
     least: float = math.nan  # [N]: the least normal force, of `weakest`
     weakest: str = ""
     trials: tuple[TuningTrial, ...] = ()
     simulations: int = 0
-    end: Array | None = field(default=None, repr=False)  # (5,): where it rests then, if it does
-    reason: str = field(default="", repr=False)  # why it does not
+    end: Array | None = field(default=None, repr=False)  # (5,): configuration of rest at the end
+    reason: str = field(default="", repr=False)  # of a failure
 
     @property
     def title(self) -> str:
-        """Its numbers, such as 3 or 9-11."""
+        """Numbers of the phases, such as 3 or 9-11."""
         return f"{self.number}" if self.number == self.last else f"{self.number}-{self.last}"
 
 
@@ -177,12 +175,12 @@ class Tuning(Result):
     """Torques tuned by the 10 % rule."""
 
     name: str  # the problem's
-    phases: tuple[PhaseTuning, ...]  # up to the first that does not succeed
+    phases: tuple[PhaseTuning, ...]  # up to the first that fails
     # (n, 3): the table of t and both torques, a repeated time being a step; None if a phase failed
     rows: Array | None = field(repr=False)
-    # of the whole, simulated without telling which contacts hold
+    # simulation of all phases without prescribed contacts
     report: free.FreeReport | None = field(repr=False)
-    reason: str  # the one sentence behind the verdict
+    reason: str  # of the verdict, a sentence
 
     derived = ("ok", "exit_status", "reason", "simulations", "duration")
 
@@ -198,16 +196,16 @@ class Tuning(Result):
 
     @property
     def duration(self) -> float | None:
-        """How long the torques last [s]; None if there are none."""
+        """Duration of the torques [s]; None if there are none."""
         return None if self.rows is None else float(self.rows[-1, 0])
 
     @property
     def simulations(self) -> int:
-        """How many simulations it took, the last one of the whole included."""
+        """Number of simulations, the last one of all phases included."""
         return sum(phase.simulations for phase in self.phases) + (self.report is not None)
 
     def to_csv(self) -> str:
-        """The torques as a table, with how many simulations they took and what was done.
+        """The torques as a table, with comments on the number of simulations and on the raises.
 
         ValueError if there are none.
         """
@@ -226,9 +224,9 @@ class Tuning(Result):
     @property
     def document(self) -> Document:
         """The verdict with its reason, and a table of the phases."""
-        acted = [phase for phase in self.phases if phase.acting]
-        torques = np.abs(np.nan_to_num([phase.quasistatic for phase in acted])).max(initial=0.0)
-        forces = np.abs(np.nan_to_num([phase.least for phase in acted])).max(initial=0.0)
+        moved = [phase for phase in self.phases if phase.acting]
+        torques = np.abs(np.nan_to_num([phase.quasistatic for phase in moved])).max(initial=0.0)
+        forces = np.abs(np.nan_to_num([phase.least for phase in moved])).max(initial=0.0)
         torque, force = fixed(min(2.0, float(torques)), 5), fixed(min(0.5, float(forces)), 4)
         columns = {
             "title": "phase:d", "until": "until", "acting": "finger:d",
@@ -236,7 +234,7 @@ class Tuning(Result):
             "supported": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
             "least": f"least c_n [N]:{force}", "weakest": "of", "simulations": "simulations:d",
         }  # fmt: skip
-        tuned = Table.of(acted, columns)
+        tuned = Table.of(moved, columns)
         last = "" if self.duration is None else f", {self.duration:.5f} s"
         return self.judge(self.name, self.reason, [tuned, f"{self.simulations} simulations{last}"])
 
@@ -253,49 +251,49 @@ def tune(
 ) -> Tuning:
     """Tune torques from the quasistatic ones, in steps of 10 %, by free simulations.
 
-    Each phase has constant torques. That of the finger behind the motion is raised until the
+    Each phase has constant torques. The acting torque, with the largest work, is raised until the
     object slides to the end of the phase, and further for speed until a contact is lost; then it
     is lowered by 10 %. Phases that pass into one another in motion are tuned as one.
 
     Parameters
     ----------
     brake     whether each phase may have one more step of its torques, which stops it at its end
-    stops     how often a phase that does not succeed with a brake may stop on its way, 0 to 7:
-              halfway, then again in the halves that do not succeed
+    stops     largest number of stops, 0 to 7, on the path of a phase that fails with a brake:
+              halfway, then halfway in the halves that fail
     squeeze   internal force of the quasistatic torques; as of `predict`
-    share     which of the raises that reach the end of a phase is taken, from the first, 0, to the
+    share     selects one of the raises that reach the end of a phase, from the first, 0, to the
               last that keeps every contact, 1
-    progress  shown each trial, in words
+    progress  called with a text on each trial
 
     InputError if the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
     squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
-    if Range(0, SETTINGS.stops).read(stops, "stops") and not brake:
+    if Range(0, SETTINGS.max_stops).read(stops, "stops") and not brake:
         raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
     options = TuningOptions(brake, squeeze, share, progress or (lambda text: None))
-    tuned: list[PhaseTuning] = []
+    tunings: list[PhaseTuning] = []
     steps: list[TuningStep] = []
-    z, clock = problem.start, 0.0
+    z, time = problem.start, 0.0
     with name_source(problem.source):
         for passage in split_passages(problem):
-            tuned += (parts := _carry(problem, passage, options, z, stops))
+            tunings += (parts := _carry(problem, passage, options, z, stops))
             for part in parts:
                 if part.end is None:
                     reason = f"phase{'s' if '-' in part.title else ''} {part.title}: {part.reason}"
-                    return Tuning(problem.name, tuple(tuned), None, None, reason)
-                steps += [step._replace(time=clock + step.time) for step in part.steps]
-                clock += part.duration + SETTINGS.pause * problem.scene.scales.time
+                    return Tuning(problem.name, tuple(tunings), None, None, reason)
+                steps += [step._replace(time=time + step.time) for step in part.steps]
+                time += part.duration + SETTINGS.pause * problem.scene.scales.time
                 z = part.end
-    rows = make_rows(steps, clock)
+    rows = make_rows(steps, time)
     report = free.verify_free(problem, TorqueProfile.join_rows(rows))
-    return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
+    return Tuning(problem.name, tuple(tunings), rows, report, report.reason)
 
 
 def _carry(
     problem: Problem, passage: Passage, options: TuningOptions, z: Array, stops: int
 ) -> list[PhaseTuning]:
-    """Tune a passage from rest at `z`, with stops on the way where that does not succeed."""
+    """Tune a passage from rest at `z`; if that fails, in halves with up to `stops` stops."""
     tuner = PassageTuner(problem, passage, z, options)
     tuning = tuner.tune()
     halves = tuner.halve() if tuning.end is None and stops else None
@@ -309,25 +307,25 @@ def _carry(
 
 
 class TuningOptions(NamedTuple):
-    """As of `tune`."""
+    """Options of `tune`."""
 
     brake: bool
     squeeze: float
     share: float
-    tell: Callable[[str], None]
+    progress: Callable[[str], None]
 
 
 class TuningDrive(NamedTuple):
     """Torques that reach the end of the phase, with a brake or without."""
 
-    # how many times the acting torque (that of the brake) is raised; lowered if negative
+    # number of raises of the acting torque (in the brake, if there is one); lowered if negative
     raised: int
     trial: TuningTrial
-    supported: int = 0  # how many times the supporting torque is raised in the brake
+    supported: int = 0  # number of raises of the supporting torque in the brake
 
 
 class PassageTuner:
-    """The rule at work on one passage from rest at `z`, shape (5,), and its trials.
+    """Tuning of one passage from rest at `z`, shape (5,), and its trials.
 
     Quasistatic torques `tau`, (2,) [N m], are raised and lowered; `last` are those at the end of
     the passage; `acting` is the index of the acting finger.
@@ -336,7 +334,7 @@ class PassageTuner:
     tau: Array
     last: Array
     acting: int
-    title: str  # what its trials are told with
+    title: str  # of the trials, in texts on progress
 
     def __init__(
         self, problem: Problem, passage: Passage, z: Array, options: TuningOptions
@@ -344,8 +342,8 @@ class PassageTuner:
         self.problem, self.passage, self.z, self.options = problem, passage, z, options
         self.until = passage.phases[-1].until
         self.end = EndDistance.to_leading(problem.scene, self.until, z)
-        self.way = float(self.measure(z[None])[0])  # how far away the end is [m or rad]
-        self.limit, self.gains = problem.scene.torque_limit, self.until.contact is not None
+        self.length = float(self.measure(z[None])[0])  # distance of the end [m or rad]
+        self.limit, self.gains_contact = problem.scene.torque_limit, self.until.contact is not None
         scales, self.time = problem.scene.scales, problem.scene.scales.time
         self.slow = SETTINGS.slow * (scales.rate if self.end.unit == "rad" else scales.speed)
         # Two freedoms where the object arrives.
@@ -354,22 +352,22 @@ class PassageTuner:
         self.simulations = 0  # trials, and landings
 
     def halve(self) -> tuple[Passage, Passage] | None:
-        """Both halves of the way, the first until x or phi is what it is there."""
+        """Both halves of the path; the first ends at the value of x or phi in the middle."""
         phases, paths = self.passage.phases, list(self._follow(self.passage.phases, self.z))
         if len(paths) < len(phases):
             return None
         ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
-        path, left = paths[k], ends[k] - ends[-1] / 2
-        x, _, phi = path.point.z[int(np.searchsorted(path.s, path.length - left)), :3].tolist()
+        path, remaining = paths[k], ends[k] - ends[-1] / 2
+        x, _, phi = path.point.z[int(np.searchsorted(path.s, path.length - remaining)), :3].tolist()
         middle = Until(coordinate="x", value=x, pins=(("phi", phi),))
         until = middle.lead(path.point.z[0], self.problem.scene.scales.length)
         part = replace(phases[k], until=replace(until, pins=()), end=End.REST)
         first = Passage((*phases[:k], part), phases[k])
-        return first, Passage(phases[k:], self.passage.after)
+        return first, Passage(phases[k:], self.passage.following)
 
     def tune(self) -> PhaseTuning:
-        """Tune it."""
+        """Tune the passage."""
         phases = self.passage.phases
         tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
@@ -382,12 +380,12 @@ class PassageTuner:
         best, (balanced, self.acting) = None, balance
         self.last, count = balanced[-1], len(self.problem.phases)
         self.title = f"phase {tuning.title} of {count}, finger {self.acting + 1}"
-        # The supporting torque at the start, then the one where it presses most: the right finger
+        # The supporting torque at the start, then the one that presses most: the right finger
         # presses anticlockwise, the left one clockwise.
-        supporting, press = balanced[:, 1 - self.acting], np.max if self.acting else np.min
-        for support in dict.fromkeys([supporting[0], press(supporting)]):
+        supporting, extreme = balanced[:, 1 - self.acting], np.max if self.acting else np.min
+        for support in dict.fromkeys([supporting[0], extreme(supporting)]):
             self.tau = np.where(np.arange(2) == self.acting, balanced[0], support)
-            attempt = self._try(replace(tuning, acting=self.acting + 1))
+            attempt = self._attempt(replace(tuning, acting=self.acting + 1))
             if attempt.end is not None:
                 return attempt
             if best is None or best.raised is None:
@@ -397,73 +395,73 @@ class PassageTuner:
         assert best is not None
         return best
 
-    def _try(self, own: PhaseTuning) -> PhaseTuning:
-        """Tune it from the present torques."""
-        own, drives = replace(own, quasistatic=self.scale(0)), self.drive()
+    def _attempt(self, new: PhaseTuning) -> PhaseTuning:
+        """Tune the passage from the present torques."""
+        new, drives = replace(new, quasistatic=self.scale(0)), self.drive()
         drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
             nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
             text = f"no constant torques reach {self.until}: the nearest trial "
             text += nearest.to_text()
-            why = "up to the torque limit"
+            limit = "up to the torque limit"
             if last.outcome is TrialOutcome.LOSES:
-                why = f"and raised {len(self.trials) - 1} times it {last.to_text()}"
-            return self._sum_up(own, last, reason=f"{text}, {why}")
+                limit = f"and raised {len(self.trials) - 1} times it {last.to_text()}"
+            return self._sum_up(new, last, reason=f"{text}, {limit}")
         if not self.options.brake:
-            # The fastest that is held where it arrives; the slowest arrives most gently.
-            held = None
+            # The fastest drive after which the object is held; slow ones arrive most gently.
+            solution = None
             for drive in drives:
-                attempt = self._hold(replace(own, raised=drive.raised), drive.trial)
+                attempt = self._hold(replace(new, raised=drive.raised), drive.trial)
                 if attempt.end is None:
-                    return held or attempt
-                held = attempt
-            assert held is not None
-            return held
-        stopped = self.brake(drives)
-        if stopped is None:
+                    return solution or attempt
+                solution = attempt
+            assert solution is not None
+            return solution
+        braked = self.brake(drives)
+        if braked is None:
             text = "no torque in steps of 10 % brings it to rest at its end: a trial "
             text += self.trials[-1].to_text()
-            return self._sum_up(own, drives[-1].trial, raised=drives[-1].raised, reason=text)
-        drive, brake = stopped
-        own = replace(own, raised=drive.raised, braked=brake.raised, supported=brake.supported)
-        return self._hold(own, brake.trial)
+            return self._sum_up(new, drives[-1].trial, raised=drives[-1].raised, reason=text)
+        drive, brake = braked
+        new = replace(new, raised=drive.raised, braked=brake.raised, supported=brake.supported)
+        return self._hold(new, brake.trial)
 
-    def _hold(self, own: PhaseTuning, trial: TuningTrial) -> PhaseTuning:
-        """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
+    def _hold(self, new: PhaseTuning, trial: TuningTrial) -> PhaseTuning:
+        """Tuning with torques that hold the object at the arrival of a trial."""
         rate = f"{trial.rate:.3g} {self.end.unit}/s at t = {trial.time:.5g} s"
         for tau in self._list_holds(trial):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
             z, text = self.land(steps, trial.time, trial.time + SETTINGS.pause * self.time)
-            own = self._sum_up(own, trial, steps=steps, end=None if text else z)
+            new = self._sum_up(new, trial, steps=steps, end=None if text else z)
             if not text:
                 break
-            own = replace(own, reason=f"{self.until} is reached at {rate}, and {text}")
-        return own
+            new = replace(new, reason=f"{self.until} is reached at {rate}, and {text}")
+        return new
 
     def _list_holds(self, trial: TuningTrial) -> list[tuple[float, float] | None]:
-        """What may hold the object: what it arrives with, or quasistatic torques lowered.
+        """Torques that may hold the object; None for those of the arrival.
 
-        Those are of the next phase, or of the end of the last one; then those it arrives with, the
-        acting one lowered, and the supporting one more so.
+        Next come quasistatic torques of the next phase, or of the end of the last one, with the
+        acting one lowered; after the last phase also both torques of the arrival, lowered.
         """
-        after = self.passage.after
-        own = self.last[None], self.acting
-        balance = own if after is None else self._balance((after,), trial.z)
+        following = self.passage.following
+        final = self.last[None], self.acting
+        balance = final if following is None else self._balance((following,), trial.z)
         if balance is None:
             return [None]
         (first, second), acting = balance[0][0].tolist(), balance[1]
-        factors = [FACTOR**n for n in range(1, SETTINGS.hold)]
+        factors = [FACTOR**n for n in range(1, SETTINGS.holds)]
         lowered = [(first / f, second) if acting == 0 else (first, second / f) for f in factors]
-        arrived, held = np.array(trial.steps[-1].tau), []
-        if after is None:
-            arrived[1 - acting] /= FACTOR**SETTINGS.hold
-            held = [tuple((arrived / FACTOR ** (SETTINGS.hold * n)).tolist()) for n in range(3)]
-        return [None, *lowered, *held]
+        tau, last = np.array(trial.steps[-1].tau), []
+        if following is None:
+            tau[1 - acting] /= FACTOR**SETTINGS.holds
+            last = [tuple((tau / FACTOR ** (SETTINGS.holds * n)).tolist()) for n in range(3)]
+        return [None, *lowered, *last]
 
     def _balance(self, phases: Sequence[Phase], z: Array) -> tuple[Array, int] | None:
-        """Torques of a quasistatic motion from `z`, (n, 2), as far as one keeps every contact.
+        """Torques of a quasistatic motion from `z`, (n, 2), and the index of the acting finger.
 
-        And the index of the torque with the most work: the finger behind the motion.
+        They extend over phases in which every contact is kept. The acting finger does most work.
         """
         tau, work = list[Array](), list[Array]()
         for path in self._follow(phases, z):
@@ -483,28 +481,28 @@ class PassageTuner:
             yield path
             z = path.point.z[-1]
 
-    def _sum_up(self, own: PhaseTuning, trial: TuningTrial, **more: Any) -> PhaseTuning:
-        """The tuning with the numbers of a trial, and what it took."""
-        more |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
-        more |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
-        return replace(own, simulations=self.simulations, **more)
+    def _sum_up(self, tuning: PhaseTuning, trial: TuningTrial, **values: Any) -> PhaseTuning:
+        """The tuning with the values of a trial, all trials, and the number of simulations."""
+        values |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
+        values |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
+        return replace(tuning, simulations=self.simulations, **values)
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether there have been so many simulations that no other torques are tried."""
-        return self.simulations > SETTINGS.simulations
+        """Whether the largest number of simulations is exceeded."""
+        return self.simulations > SETTINGS.max_simulations
 
     def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
-        """The torques raised so many times, lowered where negative."""
+        """Torques [N m] by numbers of raises of the acting and the supporting one."""
         powers = [supporting, supporting]
         powers[self.acting] = acting
         first, second = (float(tau) * FACTOR**n for tau, n in zip(self.tau, powers, strict=True))
         return first, second
 
     def drive(self) -> list[TuningDrive]:
-        """Raise the acting torque until a contact is lost; those that reach the end, by torque.
+        """Drives that reach the end, by torque: the acting one is raised until a contact is lost.
 
-        The last trial says what was lost, or that the object did not slide.
+        The last trial has the lost contact, or the outcome that the object did not slide.
         """
         drives = []
         for raised in range(SETTINGS.raises):
@@ -519,17 +517,17 @@ class PassageTuner:
         return drives
 
     def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, TuningDrive] | None:
-        """Stop a drive at the end of the phase, the fastest that lets itself be stopped.
+        """The fastest drive that a brake stops at the end of the phase, and this brake.
 
-        The acting torque is lowered to less than the slowest drive's and than balances the object
-        at the end. Where no such torque stops any drive there without losing a contact the
-        supporting one becomes that of the end.
+        The acting torque of a brake is less than that of the slowest drive and than the one that
+        balances the object at the end. If no such brake keeps all contacts, the supporting torque
+        of the end is used.
         """
         count = len(drives)
         chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
         first = min(drives[0].raised - 1, self._count_steps(self.acting))
         last = self._count_steps(1 - self.acting)
-        # With two freedoms either torque sets the object in motion again, if it is too much there.
+        # With two freedoms either torque starts a new motion at the end if it is too large.
         for supported in dict.fromkeys([last, 0] if self.is_free else [0, last]):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
@@ -540,21 +538,21 @@ class PassageTuner:
         return None
 
     def _count_steps(self, finger: int) -> int:
-        """How many times a torque is raised, lowered if negative, until it is that of the end."""
-        share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
-        return math.floor(math.log(max(share, FACTOR**-SETTINGS.raises)) / math.log(FACTOR))
+        """Number of raises, negative if lowered, from a torque to that of the end."""
+        ratio = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
+        return math.floor(math.log(max(ratio, FACTOR**-SETTINGS.raises)) / math.log(FACTOR))
 
     def _lower(self, drive: TuningTrial, first: int, supported: int) -> TuningDrive | None:
-        """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
+        """Brake with the earliest end, by lowering the acting torque; None if none stops there."""
         best: TuningDrive | None = None
-        raised, missed = first, 0
-        while raised > -SETTINGS.raises and missed < SETTINGS.failures and not self.is_exhausted:
+        raised, failed = first, 0
+        while raised > -SETTINGS.raises and failed < SETTINGS.failures and not self.is_exhausted:
             steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
-            trial = self._place(steps, drive, best and best.trial, SETTINGS.coarse * self.slow)
+            trial = self._time_brake(steps, drive, best and best.trial, SETTINGS.coarse * self.slow)
             if trial is None:
                 if best is None and self.trials[-1].outcome is TrialOutcome.LOSES:
                     break
-                missed += best is not None
+                failed += best is not None
                 raised -= SETTINGS.brake_step
                 continue
             if best and trial.time > (1 - SETTINGS.gain) * best.trial.time:
@@ -565,118 +563,121 @@ class PassageTuner:
             raised -= 1
         if best is None:
             return None
-        last = self._place(list(best.trial.steps), drive, best.trial, self.slow)
+        last = self._time_brake(list(best.trial.steps), drive, best.trial, self.slow)
         return None if last is None else best._replace(trial=last)
 
-    def _place(
-        self, steps: list[TuningStep], drive: TuningTrial, near: TuningTrial | None, slow: float
+    def _time_brake(
+        self, steps: list[TuningStep], drive: TuningTrial, similar: TuningTrial | None, speed: float
     ) -> TuningTrial | None:
-        """Find the instant from which on the last step brings the object to the end slowly.
+        """Trial with the instant of the last step at which the object reaches the end slowly.
 
-        Where a weaker brake, or nearly the same instant, is known the search begins near it.
+        False position on the distance from the end and the overshoot. The search begins near a
+        `similar` trial, of a weaker brake or with nearly the same instant.
         """
         low, high = 0.0, drive.time
-        below, above = self.way, self._overshoot(drive, slow)
-        at, side, losses = 0.5 * high, 0, 0
-        short, rate = self.way, drive.rate
-        if near is not None and slow == self.slow:
-            high, above = near.steps[-1].time, self._overshoot(near, slow)
-            at = high * (1 - 1e-4)
-        elif near is not None:
-            at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
-        for count in range(SETTINGS.trials):
-            steps = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self.run(steps, f"brake at {at:.5g} s")
+        error_low, error_high = self.length, self._overshoot(drive, speed)
+        instant, side, losses = 0.5 * high, 0, 0
+        distance, rate = self.length, drive.rate
+        if similar is not None and speed == self.slow:
+            high, error_high = similar.steps[-1].time, self._overshoot(similar, speed)
+            instant = high * (1 - 1e-4)
+        elif similar is not None:
+            instant = min(1.02 * similar.steps[-1].time, 0.5 * (similar.steps[-1].time + high))
+        for count in range(SETTINGS.max_trials):
+            steps = [*steps[:-1], steps[-1]._replace(time=instant)]
+            trial = self.run(steps, f"brake at {instant:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
-                if trial.rate < slow:
+                if trial.rate < speed:
                     return trial
-                if at < SETTINGS.bracket * drive.time:
-                    return self._graze(steps, drive) if self.is_free else None
-                high, above, rate = at, self._overshoot(trial, slow), trial.rate
-                below /= 2 if side < 0 else 1
+                if instant < SETTINGS.bracket * drive.time:
+                    return self._find_graze(steps, drive) if self.is_free else None
+                high, error_high, rate = instant, self._overshoot(trial, speed), trial.rate
+                error_low /= 2 if side < 0 else 1
                 side = -1
             else:
                 losses += trial.outcome is TrialOutcome.LOSES
-                if losses > SETTINGS.losses:
+                if losses > SETTINGS.max_losses:
                     return None
-                low, short = at, trial.short
-                # How far it is through several phases is not known.
-                below = above if short == math.inf else max(short, 1e-12 * self.way)
-                above /= 2 if side > 0 else 1
+                low, distance = instant, trial.short
+                # The distance through several phases is not known.
+                error_low = (
+                    error_high if distance == math.inf else max(distance, 1e-12 * self.length)
+                )
+                error_high /= 2 if side > 0 else 1
                 side = 1
-            jumps = short > SETTINGS.far * self.way and rate > SETTINGS.fast * drive.rate
+            jumps = distance > SETTINGS.far * self.length and rate > SETTINGS.fast * drive.rate
             if jumps and high - low < SETTINGS.bracket * high:
                 return None
-            share = below / (below + above) if count % 4 != 3 else 0.5
-            at = low + (high - low) * min(max(share, 0.02), 0.98)
+            fraction = error_low / (error_low + error_high) if count % 4 != 3 else 0.5
+            instant = low + (high - low) * min(max(fraction, 0.02), 0.98)
             if high - low < 1e-12 * high:
                 return None
         return None
 
-    def _graze(self, steps: list[TuningStep], drive: TuningTrial) -> TuningTrial | None:
-        """Find the instant to brake at which the end is just touched, on a way that always arrives.
+    def _find_graze(self, steps: list[TuningStep], drive: TuningTrial) -> TuningTrial | None:
+        """Trial with the instant of the brake at which the object just touches the end.
 
-        With two freedoms the object may turn back before the end, and come there later another way:
-        how fast it arrives has a kink where it just touches, and falls to zero there.
+        Golden-section search from a grid. With two freedoms the object may turn back before the end
+        and reach it on another path: its speed has a kink, of value zero, where it just touches.
         """
 
-        def run(at: float) -> tuple[float, TuningTrial]:
-            again = [*steps[:-1], steps[-1]._replace(time=at)]
-            trial = self.run(again, f"brake at {at:.5g} s")
+        def run(instant: float) -> tuple[float, TuningTrial]:
+            braked = [*steps[:-1], steps[-1]._replace(time=instant)]
+            trial = self.run(braked, f"brake at {instant:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
-        grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
-        runs = [run(at) for at in grid]
-        k = min(range(1, SETTINGS.grid - 1), key=lambda k: runs[k][0])
-        at, ends = grid[k], (grid[k - 1], grid[k + 1])
+        grid = [drive.time * (k + 1) / (SETTINGS.n_grid + 1) for k in range(SETTINGS.n_grid)]
+        runs = [run(instant) for instant in grid]
+        k = min(range(1, SETTINGS.n_grid - 1), key=lambda k: runs[k][0])
+        instant, ends = grid[k], (grid[k - 1], grid[k + 1])
         rate, best = runs[k]
         if rate > min(runs[k - 1][0], runs[k + 1][0]):
             return None
-        for count in range(SETTINGS.sections):
+        for count in range(SETTINGS.n_sections):
             if rate < self.slow:
                 return best
-            if count == SETTINGS.grid and rate > 2 * SETTINGS.coarse * self.slow:
+            if count == SETTINGS.n_grid and rate > 2 * SETTINGS.coarse * self.slow:
                 return None
-            near, far = sorted(ends, key=lambda end: abs(end - at))
-            other = at + (3 - math.sqrt(5)) / 2 * (far - at)
-            new, trial = run(other)
-            if new < rate:
-                ends, at, rate, best = (at, far), other, new, trial
+            inner, outer = sorted(ends, key=lambda end: abs(end - instant))
+            candidate = instant + (3 - math.sqrt(5)) / 2 * (outer - instant)
+            candidate_rate, trial = run(candidate)
+            if candidate_rate < rate:
+                ends, instant, rate, best = (instant, outer), candidate, candidate_rate, trial
             else:
-                ends = near, other
+                ends = inner, candidate
         return None
 
-    def _overshoot(self, trial: TuningTrial, slow: float) -> float:
-        """How far beyond the end the object would come to rest, less the wanted speed's part."""
+    def _overshoot(self, trial: TuningTrial, speed: float) -> float:
+        """Stopping distance beyond the end, less that from half the allowed speed [m or rad]."""
         slowing = max(trial.slowing, 0.1 * trial.rate / self.time)
-        return (trial.rate**2 - (0.5 * slow) ** 2) / (2 * slowing)
+        return (trial.rate**2 - (0.5 * speed) ** 2) / (2 * slowing)
 
     def measure(self, z: Array) -> Array:
-        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
+        """Distance from the end of the passage, from (n, 5) to (n,) [m or rad]."""
         return self.end.evaluate(z, z)[0]
 
     def run(self, steps: Sequence[TuningStep], title: str) -> TuningTrial:
-        """Simulate torques until the end of the passage, or what keeps it from coming."""
-        end = steps[-1].time + SETTINGS.lasts * self.time
+        """Simulate torques until the end of the passage, a lost contact, or rest."""
+        end = steps[-1].time + SETTINGS.trial_time * self.time
         torque = TorqueProfile.join_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
         self.trials.append(self._judge(tuple(steps), simulation))
-        self.options.tell(f"{self.title}: {title}: {self.trials[-1].to_text()}")
+        self.options.progress(f"{self.title}: {title}: {self.trials[-1].to_text()}")
         return self.trials[-1]
 
     def land(self, steps: Sequence[TuningStep], arrival: float, end: float) -> tuple[Array, str]:
         """Simulate torques that hold the object from its arrival [s] to an end [s].
 
-        Returns where it is then, (5,), and what does not hold; empty if everything rests and no
-        contact of the next phase, or else of the last one, has parted.
+        Returns the last configuration, (5,), and a failure; empty if everything rests and no
+        contact of the next phase, or else of the last one, has opened.
         """
         self.simulations += 1
         torque = TorqueProfile.join_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z)
-        names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
+        names, reason = (self.passage.following or self.passage.phases[-1]).formation.names, ""
         pauses = [(name, simulation.list_pauses(name, arrival, end)) for name in names]
-        spans = [(last - first, name) for name, each in pauses for first, last in each]
+        spans = [(stop - start, name) for name, openings in pauses for start, stop in openings]
         longest, worst = max(spans, key=lambda span: span[0], default=(0.0, ""))
         if longest > REST_WINDOW * self.time:
             reason = f"{worst} parts for {1e3 * longest:.3g} ms"
@@ -693,12 +694,12 @@ class PassageTuner:
         if len(self.passage.phases) > 1:
             return False
         gap = float(self.measure(run.z[None])[0])
-        return gap > (1 + SETTINGS.back) * self.way or (not self.gains and gap <= 0)
+        return gap > (1 + SETTINGS.back) * self.length or (not self.gains_contact and gap <= 0)
 
     def find_ends(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
-        """When the phases end [s], as far as they do, and the first loss of a contact before.
+        """End times of the phases that end [s], and the first loss of a contact before them.
 
-        Events end a phase that gains or releases a contact; a coordinate that ends one is no event.
+        Only ends by gains and releases of contacts are events; ends at a coordinate are not.
         """
         ends: list[float] = []
         for event in events:
@@ -706,8 +707,8 @@ class PassageTuner:
             if phase.until.contact is not None:
                 is_end = event.kind in free.TOUCHES and event.contact == phase.until.contact.name
             else:
-                leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else ()
-                is_end = lost and event.contact in leaving
+                released = free.list_released(self.problem, phase) if phase.until.is_release else ()
+                is_end = lost and event.contact in released
             if is_end:
                 ends.append(event.time)
                 if len(ends) == len(self.passage.phases):
@@ -720,31 +721,31 @@ class PassageTuner:
         gaps, phases = self.measure(simulation.z), self.passage.phases
         ends, lost = self.find_ends(simulation.events)
         arrival = ends[-1] if len(ends) == len(phases) else math.inf
-        if not self.gains and gaps.min() <= 0:
+        if not self.gains_contact and gaps.min() <= 0:
             row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
             a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
             arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
         starts = [0.0, *ends][: len(phases)]
         start = starts[-1] if len(starts) == len(phases) else math.inf  # of the last phase
-        # When the end, once nearer, is farther away again.
-        near = np.minimum.accumulate(np.where(simulation.t >= start, gaps, math.inf))
-        back = simulation.t[gaps - near > SETTINGS.back * abs(self.way)]
-        turn = float(back.min(initial=math.inf))
-        stop = min(arrival, turn, float(simulation.t[-1]))
-        # When contacts of its phases part, also those that never press.
+        # Time at which the distance from the end begins to grow again.
+        nearest = np.minimum.accumulate(np.where(simulation.t >= start, gaps, math.inf))
+        receding = simulation.t[gaps - nearest > SETTINGS.back * abs(self.length)]
+        turn_time = float(receding.min(initial=math.inf))
+        stop = min(arrival, turn_time, float(simulation.t[-1]))
+        # Times at which contacts of the phases open, also those that never press.
         losses = [] if lost is None else [(lost.time, lost.contact)]
-        for phase, first, last in zip(phases, starts, [*starts[1:], stop], strict=False):
-            parted = free.find_losses(simulation, phase, first, last, DEPARTURE)
-            losses += [(loss.time, loss.contact) for loss in parted]
+        for phase, start_of, end_of in zip(phases, starts, [*starts[1:], stop], strict=False):
+            opened = free.find_losses(simulation, phase, start_of, end_of, DEPARTURE)
+            losses += [(loss.time, loss.contact) for loss in opened]
         losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(simulation.t, time))
         t, c_n, gaps = (part[: at + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
-        # The step in which a coordinate arrives goes on beyond that.
+        # The step of the simulation may extend beyond the arrival of a coordinate.
         if t[at] > time:
             sample, t[at] = simulation.trajectory.at([time]), time
             gaps[at], c_n[at] = self.measure(sample.z)[0], sample.c_n[0]
-        short = float(gaps[t >= start].min(initial=math.inf))
+        distance = float(gaps[t >= start].min(initial=math.inf))
         least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
         if losses:
             outcome = TrialOutcome.LOSES
@@ -753,28 +754,28 @@ class PassageTuner:
         elif arrival == stop:
             outcome = TrialOutcome.ARRIVES
         else:
-            rests = turn == stop or not simulation.z_dot[at].any()
-            outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
+            stopped = turn_time == stop or not simulation.z_dot[at].any()
+            outcome = TrialOutcome.RESTS if stopped else TrialOutcome.LASTS
         z, v, z_ddot = (part[[at]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
-        if not self.gains and time > 0:
+        if not self.gains_contact and time > 0:
             z, v, z_ddot = simulation.trajectory.at([time])[:3]
-        _, (gradient,), (bend,) = self.end.evaluate(z, v)
-        rate, slowing = -float(gradient @ v[0]), float(gradient @ z_ddot[0] + bend)
-        at_last = contact, rate, slowing, short, least, weakest, z[0]
-        return TuningTrial(steps, outcome, time, *at_last)
+        _, (gradient,), (curvature,) = self.end.evaluate(z, v)
+        rate, slowing = -float(gradient @ v[0]), float(gradient @ z_ddot[0] + curvature)
+        values = contact, rate, slowing, distance, least, weakest, z[0]
+        return TuningTrial(steps, outcome, time, *values)
 
     def _find_least(
         self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]
     ) -> tuple[float, str, int]:
-        """The least of normal forces over time, of which contact, and in which row."""
+        """The least normal force over time [N], its contact and its row."""
         phases = self.passage.phases
-        of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
+        owners = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
         names = list(dict.fromkeys(name for phase in phases for name in phase.formation.names))
         c_n = np.nan_to_num(forces[:, [contacts.index(name) for name in names]], nan=math.inf)
         for index, phase in enumerate(phases):
             # Contacts that the phase releases at its end do not count.
-            leaving = free.list_leaving(self.problem, phase) if phase.until.is_release else set()
-            others = [name in leaving or name not in phase.formation.names for name in names]
-            c_n[np.ix_(of == index, others)] = math.inf
+            released = free.list_released(self.problem, phase) if phase.until.is_release else set()
+            others = [name in released or name not in phase.formation.names for name in names]
+            c_n[np.ix_(owners == index, others)] = math.inf
         row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
         return float(c_n[row, column]), names[int(column)], int(row)

@@ -32,7 +32,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..common.document import Table, plain
+from ..common.document import Table, to_plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import check_phases, trace_phases
 from ..planning.nlp import open_ledger
@@ -109,7 +109,7 @@ def answer(case: Case, folder: Path) -> Row:
         row = FAMILIES[family][0](folder, *arguments)
     except wholearm.WholearmError as error:
         row = _refuse(error)
-    text = json.dumps(plain(row))
+    text = json.dumps(to_plain(row))
     return dict(json.loads(text, parse_float=lambda digits: float(f"{float(digits):.9g}")))
 
 
@@ -328,12 +328,8 @@ def _assess(folder: Path, name: str) -> Row:
     plan = wholearm.solve(problem, "margin")
     start = partial(ThreadPoolExecutor, 1)
     study = wholearm.assess_robustness(problem, plan, samples=40, phase=3, start=start)
-    return {
-        "samples": len(study.records),
-        "goals": study.reached.hits,
-        "kept": study.kept.hits,
-        "first": sorted(study.first_lost),
-    }
+    counts = {"goals": study.reached.hits, "kept": study.kept.hits}
+    return {"samples": len(study.records), **counts, "first": sorted(study.first_lost)}
 
 
 def _compare(folder: Path, name: str) -> Row:
@@ -375,13 +371,13 @@ def _report(folder: Path, name: str) -> Row:
 
 def _draw_map(folder: Path, name: str) -> Row:
     chart = wholearm.build_map(_load(folder, name))
-    points = np.array([crossing.point for crossing in chart.crossings])
+    x, phi = np.sort([crossing.point for crossing in chart.crossings], axis=0).T.tolist()
     return {
         "formations": _count(chart.formations),
         "borders": _count(border.contacts for border in chart.borders),
         "crossings": _count(crossing.contacts for crossing in chart.crossings),
-        "x": np.sort(points[:, 0]).tolist(),
-        "phi": np.sort(points[:, 1]).tolist(),
+        "x": x,
+        "phi": phi,
         "forth": sum(int(border.forth.sum()) for border in chart.borders),
         "back": sum(int(border.back.sum()) for border in chart.borders),
         "possible": chart.possible.sum(axis=0).tolist(),
@@ -459,29 +455,23 @@ def _read(folder: Path, number: int) -> Row:
     """A problem file with another entry."""
     table = copy.deepcopy(BASE)
     change = change_tree(np.random.default_rng([SEED, number]), table, STRANGE)
-    return {"change": change} | _try_file("problem.toml", write_toml(table).encode(), wholearm.load)
+    return {"change": change} | _try(wholearm.load, "problem.toml", write_toml(table).encode())
 
 
-def _try(work: Callable[[], object]) -> Row:
-    """Whether something is refused, by which message."""
-    try:
-        work()
-    except (wholearm.WholearmError, TypeError) as error:
-        return {"refused": type(error).__name__, "message": str(error)}
-    return {"refused": ""}
-
-
-def _try_file(name: str, content: bytes, work: Callable[[str], object]) -> Row:
-    """Whether a file is refused, by a message that does not name the folder."""
+def _try(work: Callable[[str], object], name: str = "none", content: bytes = b"") -> Row:
+    """Whether work on a file is refused, by a message that does not name its folder."""
     with tempfile.TemporaryDirectory() as place:
         path = Path(place, name)
         path.write_bytes(content)
-        row = _try(partial(work, str(path)))
-    return {key: text.replace(str(path), "F") for key, text in row.items()}
+        try:
+            work(str(path))
+        except (wholearm.WholearmError, TypeError) as error:
+            return {"refused": type(error).__name__, "message": str(error).replace(str(path), "F")}
+    return {"refused": ""}
 
 
 def _ask(folder: Path, name: str) -> Row:
-    row = _try(partial(wholearm.solve, _load(folder, FOUR), **OPTIONS[name]))
+    row = _try(lambda _: wholearm.solve(_load(folder, FOUR), **OPTIONS[name]))
     return {key: mask(text) for key, text in row.items()}
 
 
@@ -493,7 +483,7 @@ def _read_torques(folder: Path, number: int) -> Row:
     def verify(path: str) -> None:
         wholearm.verify(_load(folder, "square"), wholearm.read_torque_csv(path))
 
-    return {"change": change} | _try_file("bad.csv", content, verify)
+    return {"change": change} | _try(verify, "bad.csv", content)
 
 
 FAMILIES: dict[str, tuple[Callable[..., Row], list[Case]]] = {
@@ -725,12 +715,11 @@ def perturb_scenes(seed: int) -> None:
 
 
 def _change(value: Any, label: str) -> Any:
-    if isinstance(value, np.ndarray):
-        changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(value)]
-        return np.array(changed).reshape(value.shape)
-    if isinstance(value, Real) and not isinstance(value, bool):
-        return _change_number(float(value), label)
-    return value
+    if isinstance(value, bool) or not isinstance(value, Real | np.ndarray):
+        return value
+    given = np.asarray(value, dtype=float)
+    changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(given)]
+    return np.array(changed).reshape(given.shape) if given.ndim else changed[0]
 
 
 @cache

@@ -1,6 +1,6 @@
 """Run time against error, of planners and simulators, with public tools beside them.
 
-Methods run on phases of one freedom, on four sliding contacts. Planners are ours in both domains,
+Methods run on phases of one freedom, on four sliding contacts. Planners are ours along curves,
 toppra (minimum-time parametrisation, with the internal force eliminated from the limits) and yapss
 (pseudospectral collocation). All simulators but ours are told when directions reverse, from the
 reference, and are restarted there and where the torques step. Plans are replayed open loop from
@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.stats import gmean
 
 from ..common.arrays import Array, Expression, Numbers
 from ..common.document import Table
@@ -49,7 +50,6 @@ from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
 from ..planning.path_domain.path_motion import NODES, PathMotion, Profile, lay_out
 from ..planning.path_domain.path_plan import LimitShape, Task, build_path_nlp, guess, plan_curves
-from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
@@ -173,8 +173,7 @@ def _time(work: Callable[[], Any]) -> tuple[float, Any]:
 
 def find_mean(seconds: Sequence[float]) -> float:
     """Shifted geometric mean [s]."""
-    logs = [math.log(value + SHIFT) for value in seconds]
-    return math.exp(math.fsum(logs) / len(logs)) - SHIFT
+    return float(gmean(np.array(seconds) + SHIFT)) - SHIFT
 
 
 def solve_motion(
@@ -221,33 +220,30 @@ def integrate(
 ) -> tuple[Array, list[Array], float]:
     """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
 
-    A stretch is in one piece of the torques, without a reversal: Xi, sigma, the coefficients of the
-    piece column by column, its ends, and those of the stretch. Contacts stay closed: those that are
-    lost pull.
+    A stretch is in one piece of the torques, without a reversal: Xi, sigma, coefficients of its
+    torques column by column, and its ends. Contacts stay closed: those that are lost pull.
     """
-    parts = [*curve.segments]
+
+    def solve(t: float, y: Array, part: Segment, own: TorqueProfile) -> tuple[Array, Array]:
+        tau = own.at(np.array([t]))[0]
+        return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
+
+    def rates(t: float, y: Array, *at: Any) -> Array:
+        return np.concatenate([y[5:], solve(t, y, *at)[0]])
+
+    parts, t = [*curve.segments], float(torque.breaks[0])
     y, stretches, least = np.append(problem.start, np.zeros(5)), list[Array](), np.inf
-    for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
-        profile = torque.cut(t, stop)
-        polynomial = [torque.coefficients[piece].ravel("F"), [t, stop]]
+    for stop in torque.breaks[1:]:
         while t < stop:
-            part = parts[0]
-
-            def solve(
-                t: float, y: Array, part: Segment = part, own: TorqueProfile = profile
-            ) -> tuple[Array, Array]:
-                tau = own.at(np.array([t]))[0]
-                return solve_motion(curve.formation, y[:5], y[5:], tau, part.Xi, part.sigma)
-
-            def rates(t: float, y: Array, solve: Any = solve) -> Array:
-                return np.concatenate([y[5:], solve(t, y)[0]])
-
+            part, profile = at = parts[0], torque.cut(t, stop)
             events = [_find_reversal(curve.formation, *parts[:2])] if len(parts) > 1 else []
-            options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "events": events}
-            run = solve_ivp(rates, (t, stop), y, "DOP853", **options)
-            least = min([least, *(solve(*at)[1].min() for at in zip(run.t, run.y.T, strict=True))])
+            options: Any = {"events": events, "rtol": tolerance, "atol": tolerance}
+            run = solve_ivp(rates, (t, stop), y, "DOP853", args=at, **options)
+            forces = (solve(*state, *at)[1] for state in zip(run.t, run.y.T, strict=True))
+            least = min(least, *map(np.min, forces))
             start, t, y = t, float(run.t[-1]), run.y[:, -1]
-            stretches.append(np.concatenate([part.Xi, part.sigma, *polynomial, [start, t]]))
+            own = profile.cut(start, t).coefficients[0].ravel("F")
+            stretches.append(np.concatenate([part.Xi, part.sigma, own, [start, t]]))
             parts = parts[1:] if run.status == 1 else parts
     return y, stretches, float(least)
 
@@ -257,7 +253,7 @@ def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any
     directions = np.append(before.Xi, before.sigma)
     row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
-    def rate(_: float, y: Array) -> float:
+    def rate(_: float, y: Array, *__: Any) -> float:
         return float(slides(formation, y[None, :5], y[None, 5:])[0, row])
 
     rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
@@ -286,24 +282,22 @@ def build_own(course: Course, setting: str) -> Callable[[], Array]:
 
 def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
     """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
-    tolerance, torque = float(setting), course.torque
     formation = course.problem.phases[0].formation
-    n_c, terms = formation.n_contacts, torque.coefficients.shape[2]
-    x, y, Xi, sigma = (ca.SX.sym(name, n) for name, n in zip("xyXs", (1, 10, n_c, 2), strict=True))
-    flat, piece, ends = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2), ca.SX.sym("ends", 2)
-    half, t = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
-    place = (2 * t - piece[0] - piece[1]) / (piece[1] - piece[0])
+    n_c, terms = formation.n_contacts, course.torque.coefficients.shape[2]
+    sizes = {"x": 1, "y": 10, "Xi": n_c, "sigma": 2, "flat": 2 * terms, "ends": 2}
+    x, y, Xi, sigma, flat, ends = (ca.SX.sym(name, size) for name, size in sizes.items())
     # Coefficients come column by column.
-    powers = ca.reshape(flat, 2, -1)[:, ::-1]
-    tau = ca.vertcat(*(ca.polyval(powers[k, :].T, place) for k in range(2)))
+    tau = ca.reshape(flat, 2, -1) @ x ** ca.DM(range(terms))
     # Accelerations of the contacts are affine in the forces, and have to vanish.
     plant, c_n = build_plant(formation), ca.SX.sym("c_n", n_c)
     of_forces, apart = ca.linear_coeff(plant(y[:5], y[5:], tau, c_n, Xi, sigma)[1], c_n)
     forces = -ca.solve(of_forces, apart)
     rates = ca.vertcat(y[5:], plant(y[:5], y[5:], tau, forces, Xi, sigma)[0])
-    system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, piece, ends), "ode": half * rates}
-    options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
+    half = (ends[1] - ends[0]) / 2
+    system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, ends), "ode": half * rates}
+    options: dict[str, Any] = dict.fromkeys(("abstol", "reltol"), float(setting))
     options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
+    options["max_num_steps"] = 100000
     step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
     chain = step.mapaccum(len(course.stretches))
     start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(course.stretches).T
@@ -337,8 +331,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     else:
         task = Task((curve,), problem.epsilon, PlanOptions(), (1,))
         motion, degree = plan_curves(task)[0].motion, 6
-    looks = np.linspace(0.0, motion.duration, 201)
-    if motion.evaluate(looks).c_n.min() <= 0:
+    if motion.evaluate(np.linspace(0.0, motion.duration, 201)).c_n.min() <= 0:
         return None
     marks = find_reversals(motion)
     stop = marks[-2] + 0.95 * (marks[-1] - marks[-2])
@@ -360,11 +353,8 @@ def check_plan(instance: Instance, plan: Plan) -> tuple[float, float, str]:
     problem, curve = instance.problem, instance.curve
     state, _, least = integrate(problem, plan, curve, 1e-10)
     end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
-    limit = problem.scene.torque_limit
-    places = np.cos(np.linspace(0.0, np.pi, 9))
-    excess = float((np.abs(plan.at_places(places)) / limit[:, None] - 1).max())
-    missing = (problem.epsilon - least) / problem.scene.scales.force
-    violation = max(0.0, excess, missing)
+    excess = float((plan.peaks / problem.scene.torque_limit).max()) - 1
+    violation = max(0.0, excess, (problem.epsilon - least) / problem.scene.scales.force)
     tests = (
         (least > 0, "a contact is lost between nodes"),
         (end <= 1e-2, "the replay ends elsewhere"),
@@ -406,14 +396,6 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], Plan]:
     return lambda: plan_curves(Task((curve,), epsilon, options, (1,)))[0].torque
 
 
-def _build_over_time(instance: Instance, setting: str) -> Callable[[], Plan]:
-    """Ours over time; a setting is the number of intervals, and the degree."""
-    intervals, degree = map(int, setting.split(" x "))
-    options = PlanOptions(time_intervals=intervals, degree=degree, transcription="time")
-    problem = instance.problem
-    return lambda: plan_phases(problem, problem.phases, problem.start, options)[0].torque
-
-
 def _limit(instance: Instance, s: Array, owner: Numbers) -> PathLimits:
     """Limits at places of a curve, whose segments are `owner`."""
     curve, point = instance.curve, instance.curve.evaluate(s)
@@ -432,11 +414,10 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], Plan]:
     length = instance.curve.length
     apart = 1e-7 * length  # of grid points from a reversal between them
     grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
-    for part in instance.curve.segments[:-1]:
-        near = np.abs(grid - part.stop) > 4 * apart
-        grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
-        grid.sort()
     stops = [part.stop for part in instance.curve.segments[:-1]]
+    for stop in stops:
+        far = grid[np.abs(grid - stop) > 4 * apart]
+        grid = np.sort([*far, stop - apart, stop + apart])
     rows = _limit(instance, grid, np.searchsorted(stops, grid)).eliminate().rows
     constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
@@ -466,13 +447,10 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> TorqueProfile:
     The two points beside a reversal become one, with a step of the torques.
     """
     stops = np.array([part.stop for part in instance.curve.segments[:-1]])
-    for stop in stops:
-        k = int(np.searchsorted(grid, stop)) - 1
-        speed = (speeds[k] + speeds[k + 1]) / 2
-        grid, speeds = (
-            np.concatenate([part[:k], [middle], part[k + 2 :]])
-            for part, middle in ((grid, stop), (speeds, speed))
-        )
+    later = np.searchsorted(grid, stops)
+    grid, speeds = grid.copy(), speeds.copy()
+    grid[later], speeds[later] = stops, (speeds[later - 1] + speeds[later]) / 2
+    grid, speeds = (np.delete(part, later - 1) for part in (grid, speeds))
     steps, b = np.diff(grid), speeds**2
     a, owner = np.diff(b) / (2 * steps), np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
     ends = [
@@ -531,13 +509,9 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], Plan]:
     last.lower[5 + progress] = last.upper[5 + progress] = 0.0
     ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
     ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
-    ocp.spectral_method = "lg"
-    for name, value in {
-        "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
-        "mu_strategy": "adaptive",
-    }.items():  # fmt: skip
-        setattr(ocp.ipopt_options, name, value)
-
+    ocp.spectral_method, ipopt = "lg", ocp.ipopt_options
+    ipopt.print_level, ipopt.sb, ipopt.max_iter = 0, "yes", 1000
+    ipopt.tol, ipopt.bound_relax_factor, ipopt.mu_strategy = 1e-8, 0.0, "adaptive"
     return lambda: _read(ocp.solve())
 
 
@@ -554,21 +528,17 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
         for index in arg.phase_list:
             phase, part = arg.phase[index], curve.segments[index]
             # CasADi symbols in wrappers.
-            state, control = (
-                [(x if hasattr(x, "_value") else x.item())._value for x in symbols]
-                for symbols in (phase.state, phase.control)
-            )
-            z, v = ca.vertcat(*state[:5]), ca.vertcat(*state[5:])
-            tau, c_n = ca.vertcat(*control[:2]), ca.vertcat(*control[2:])
-            acceleration, missed = plant(z, v, tau, c_n, part.Xi, part.sigma)
-            rates = [*phase.state[5:], *(SXW(x) for x in ca.vertsplit(acceleration))]
-            phase.dynamics[:] = tuple(rates)
-            phase.path[:] = tuple(SXW(x) for x in ca.vertsplit(missed))
+            symbols = [*phase.state, *phase.control]
+            x = ca.vertcat(*((x if hasattr(x, "_value") else x.item())._value for x in symbols))
+            parts = ca.vertsplit(x, [0, 5, 10, 12, len(symbols)])
+            acceleration, missed = map(ca.vertsplit, plant(*parts, part.Xi, part.sigma))
+            phase.dynamics[:] = (*phase.state[5:], *map(SXW, acceleration))
+            phase.path[:] = tuple(map(SXW, missed))
 
     def discrete(arg: Any) -> None:
-        links = []
-        for before, after in zip(arg.phase, arg.phase[1:], strict=False):
-            links += [after.initial_time - before.final_time]
+        links = list[Any]()
+        for before, after in pairwise(arg.phase):
+            links.append(after.initial_time - before.final_time)
             links += [*(after.initial_state - before.final_state)]
         arg.discrete = links
 
@@ -595,11 +565,6 @@ PLANNERS = {
         "accuracy; limits tightened between nodes included",
         _build_on_curve,
         {LEAST_TIME: _CURVE, NO_DRAG: _CURVE},
-    ),
-    "wholearm, time": Method(
-        "Radau, intervals x degree; linear torques, refinement included",
-        _build_over_time,
-        {LEAST_TIME: ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")},
     ),
     "yapss": Method(
         "two Legendre-Gauss points a segment, automatic second derivatives; adaptive barrier, the "

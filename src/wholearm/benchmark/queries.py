@@ -76,8 +76,8 @@ class Queries(Study):
         try:
             answer = find_route(problem, objective)
         except WholearmError as error:
-            row["kind"] = "blocked" if isinstance(error, InfeasibleError) else "no answer"
-            return row | {"why": str(error), "first": time.process_time() - started}
+            kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
+            return row | {"kind": kind, "why": str(error), "first": time.process_time() - started}
         row["first"] = time.process_time() - started
         row |= {"gap": answer.gap, "value": answer.plan.value, "phases": len(answer.plan.phases)}
         failures = verify(answer.problem, answer.plan).failures

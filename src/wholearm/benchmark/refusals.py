@@ -26,17 +26,17 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import BPoly
 from scipy.optimize import brentq, linprog
 
 from ..common.arrays import Array, Expression, Flags
-from ..common.errors import InputError, WholearmError
+from ..common.errors import WholearmError
 from ..contacts.formation import Formation
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import metric_weights, null_vector
@@ -62,32 +62,40 @@ class Trace(NamedTuple):
 
 def follow(phase: Phase, z: Array) -> tuple[Trace, Trace]:
     """Follow a phase's contacts from `z`, shape (5,), both ways."""
-
-    def equations(z: Array) -> tuple[Array, Array]:
-        gaps, rows = constrain(phase.formation, z[None])
-        return gaps[0], rows[0, : gaps.shape[1]]
-
     # The phase before ends where bodies overlap by `OVERLAP`.
-    closed = project(phase.formation.scene, equations, z)
+    closed = project(phase, z)
     z = z if closed is None else closed
     return _march(phase, z, 1.0), _march(phase, z, -1.0)
 
 
-def project(
-    scene: Scene, equations: Callable[[Array], tuple[Array, Array]], z: Array
-) -> Array | None:
-    """Nearest zero of equations to `z`, by Newton's method; None if none.
+def project(phase: Phase, z: Array, end: bool = False) -> Array | None:
+    """Nearest configuration to `z` that closes a phase's contacts, at its `end` if that is asked.
 
-    `equations` gives their values, shape (m,), and rows of their Jacobian, (m, 5).
+    By Newton's method; None if there is none.
     """
+    scene = phase.formation.scene
     scale, size = np.sqrt(metric_weights(scene)), scene.scales.length
     for _ in range(20):
-        miss, rows = equations(z)
+        miss, rows = _find_misses(phase, z, end)
         step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ miss / scale
         z = z + step
         if np.abs(step * scale).max() < 1e-13 * size:
             break
-    return z if np.abs(equations(z)[0]).max() < 1e-9 * size else None
+    return z if np.abs(_find_misses(phase, z, end)[0]).max() < 1e-9 * size else None
+
+
+def _find_misses(phase: Phase, z: Array, end: bool) -> tuple[Array, Array]:
+    """Gaps at one configuration, with `end` also what is missing to that, and their rows (m, 5)."""
+    (gaps,), (rows,) = constrain(phase.formation, z[None])
+    rows, contact = rows[: len(gaps)], phase.until.contact
+    if not end:
+        return gaps, rows
+    if contact is not None:
+        touch = locate(phase.formation.scene, contact.name, z[None])
+        gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
+    places = dict(phase.until.poses)
+    missing = [z[k] - value for k, value in places.items()]
+    return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])
 
 
 def constrain(formation: Formation, z: Array) -> tuple[Array, Array]:
@@ -278,21 +286,16 @@ def _solve_along(
     chord = b[moving] / root
     bent = [(x * root + chord / x) / 2 - between for x in np.geomspace(1e-3, 1.0, 13)]
     bent.append(between - chord)
-    upper = ca.vertcat(_stack(kept) - margin, _stack(bent))
-    (A_ub, b_ub), (A_eq, b_eq) = (_split(rows, unknowns) for rows in (upper, _stack(equal)))
+    upper = [*(rows - margin for rows in kept), *bent]
+    (A_ub, b_ub), (A_eq, b_eq) = (_split(parts, unknowns) for parts in (upper, equal))
     least = np.repeat([0.0, -np.inf], [2 * n, 2 * count + 1])
     most = [*top, *np.where(top > 0, np.inf, 0.0), *np.full(2 * count, np.inf), 1.0]
     return maximise(-A_ub, b_ub, A_eq, -b_eq, [*zip(least, most, strict=True)])
 
 
-def _stack(parts: Sequence[Expression]) -> Expression:
-    """All entries of matrices in one column."""
-    return ca.vertcat(*map(ca.vec, parts))
-
-
-def _split(rows: Expression, unknowns: Expression) -> tuple[Any, Array]:
-    """Coefficients of rows that are linear in the unknowns, and what is left without these."""
-    A, rest = map(ca.evalf, ca.linear_coeff(rows, unknowns))
+def _split(parts: Sequence[Expression], unknowns: Expression) -> tuple[Any, Array]:
+    """Coefficients of all entries, which are linear in the unknowns, and what is left of them."""
+    A, rest = map(ca.evalf, ca.linear_coeff(ca.vertcat(*map(ca.vec, parts)), unknowns))
     return A.sparse(), rest.full()[:, 0]
 
 
@@ -301,30 +304,25 @@ def uniqueness_ratio(formation: Formation, z: Array, z_s: Array) -> Array:
 
     A contact that does not slide sticks, or slips either way. Forces are not unique at 0 and below.
     """
-    rates = np.abs(slides(formation, z, z_s)[:, : formation.n_contacts]).max(axis=0)
-    still = [c for c, rate in zip(formation.contacts, rates, strict=True) if rate < 1e-9]
-    held = replace(formation, rolling=tuple({*formation.rolling, *still}))
-    signs, rows = _signs(formation, z, z_s), constrain(held, z)[1]
-    light, ratios = rows / formation.scene.mass_diagonal, [np.ones(len(z))]
-    without = light @ rows.transpose(0, 2, 1)
-    slips, options = list[Array](), list[list[Any]]()
-    for k, name in enumerate(formation.names):
-        # Of each choice the rows of accelerations, and the columns of forces.
-        options.append([((), ()), ((k,), (k,))])
-        if k in held.rolling_rows:
-            touch, column = locate(formation.scene, name, z), rows.shape[1] + len(slips)
-            slips += [touch.normal - sign * touch.friction * touch.tangent for sign in (1, -1)]
-            sticks = (k, formation.n_contacts + held.rolling_rows.index(k))
-            options[k][1:] = [(sticks, sticks), ((k,), (column,)), ((k,), (column + 1,))]
+    touches = [locate(formation.scene, name, z) for name in formation.names]
+    normals = np.stack([touch.normal for touch in touches], axis=1)
+    tangents = np.stack([touch.tangent for touch in touches], axis=1)
+    rates = np.abs(slides(formation, z, z_s)[:, : len(touches)]).max(axis=0)
+    rates[list(formation.rolling_rows)] = 0.0
+    # None: a contact is open; 0, 1, -1: one sticks or slips; NaN: one slides as along the curve.
+    options = [(None, 0.0, 1.0, -1.0) if rate < 1e-9 else (None, np.nan) for rate in rates]
+    signs, ratios = _signs(formation, z, z_s)[:, : len(touches)], [np.ones(len(z))]
     for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        columns = [_push(held, z, side), *(slip[:, :, None] for slip in slips)]
-        matrix = light @ np.concatenate(columns, axis=2)
-        for choices in product(*options):
-            of_rows, forces = (sum(parts, ()) for parts in zip(*choices, strict=True))
-            smooth = without[:, of_rows][:, :, of_rows]
-            below = np.linalg.det(smooth)
+        for choice in product(*options):
+            closed, given = [sense is not None for sense in choice], np.array(choice, dtype=float)
+            senses, stuck = np.where(np.isnan(given), side, given), tangents[:, given == 0]
+            friction = (formation.friction * senses)[..., None] * tangents
+            rows = np.concatenate([normals[:, closed], stuck], axis=1)
+            forces = np.concatenate([(normals - friction)[:, closed], stuck], axis=1)
+            light = rows / formation.scene.mass_diagonal
+            smooth = light @ rows.transpose(0, 2, 1)
+            below, minor = np.linalg.det(smooth), np.linalg.det(light @ forces.transpose(0, 2, 1))
             independent = below > 1e-12 * np.einsum("nii->ni", smooth).prod(axis=1)
-            minor = np.linalg.det(matrix[:, of_rows][:, :, forces])
             ratios.append(np.divide(minor, below, out=np.ones_like(below), where=independent))
     return np.asarray(np.min(ratios, axis=0))
 
@@ -374,15 +372,12 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
     refusal of several is confirmed by that of any, and refuted by a motion of all.
     """
     match = re.search(r"phases?[ \[](\d+)(?: and (\d+)| to (\d+))?", str(error))
-    number = int(match[1]) if match else 1
-    last = int(match[2] or match[3] or match[1]) if match else len(problem.phases)
-    z = problem.start
-    open_end = Verdict("open", "")
-    planned = False
-    for phase in problem.phases:
-        concerned = number <= phase.number <= last
-        if planned and not concerned:
-            continue
+    numbers = [int(number) for number in match.groups() if number] if match else [1]
+    first, phases = numbers[0], problem.phases[: numbers[-1] if match else None]
+    z, index, verdict = problem.start, 0, Verdict("open", "")
+    while index < len(phases):
+        phase = phases[index]
+        concerned, index = phase.number >= first, phase.number
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
@@ -393,22 +388,18 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
-            if concerned:
-                verdict = _judge_curve(problem, phase, trace)
-                if verdict.kind != "refuted" or phase.number == last:
-                    return verdict
-                open_end = verdict
+            verdict = _judge_curve(problem, phase, trace) if concerned else verdict
+            if concerned and verdict.kind != "refuted":
+                break
             z = trace.end
             continue
         if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
-        before = None if concerned else _find_start(problem, number)
+        before = None if concerned else _find_start(problem, first)
         if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
-        z, planned = before, True
-    if isinstance(error, InputError) and not open_end.reason:
-        return Verdict("refuted", "every phase reaches its until")
-    return open_end
+        z, index = before, first - 1
+    return verdict
 
 
 def _find_start(problem: Problem, number: int) -> Array | None:
@@ -468,17 +459,16 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
 def list_ends(phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
     scene, formation = phase.formation.scene, phase.formation
-    project_end = partial(project, scene, partial(_end_equations, phase))
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = project_end(bend(formation, z, line[None])[0, -1])
-    first = project_end(z) if first is None else first
+    first = project(phase, bend(formation, z, line[None])[0, -1], end=True)
+    first = project(phase, z, end=True) if first is None else first
     if first is None:
         return np.zeros((0, 5))
     scale, far = np.sqrt(metric_weights(scene)), 0.08 * scene.scales.length * 1.12 ** np.arange(16)
-    tangent = np.linalg.svd(_end_equations(phase, first)[1] / scale)[2][-1] / scale
+    tangent = np.linalg.svd(_find_misses(phase, first, end=True)[1] / scale)[2][-1] / scale
     steps = () if phase.until.pins else np.outer((1.0, -1.0), far.cumsum()).ravel()
-    others = [project_end(first + step * tangent) for step in steps]
+    others = [project(phase, first + step * tangent, end=True) for step in steps]
     points = np.array([first, *(end for end in others if end is not None)])
     return points[inside(formation, points)]
 
@@ -496,7 +486,7 @@ def find_best(
     # Control points of cubic curves, shape (n, 4, 2): straight ones, and 400 that bend.
     share = np.linspace(0, 1, 4)[:, None]
     straight = share * (goals - start)[:, None] + start
-    drawn = share * (goals[rng.integers(len(goals), size=400)] - start)[:, None] + start
+    drawn = straight[rng.integers(len(goals), size=400)]
     width = 0.5 * rng.uniform(size=(400, 1, 1)) * size
     drawn[:, 1:3] += width * rng.normal(size=(400, 2, 2))
     margins, tried = [-np.inf], [z[None]]
@@ -514,14 +504,12 @@ def find_best(
 
 def bend(formation: Formation, z: Array, controls: Array) -> Array:
     """Configurations of cubic curves from `z`, forty along each, shape (n, 40, 5)."""
-    u = np.linspace(0.0, 1.0, 40)[:, None]
-    shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
-    poses = np.einsum("uk,nkd->nud", shares, controls)
-    curves = np.tile(z, (*poses.shape[:2], 1))
-    for k in range(1, len(u)):
+    poses = BPoly(controls.swapaxes(0, 1)[:, None], [0.0, 1.0])(np.linspace(0.0, 1.0, 40))
+    curves = [np.tile(z, (len(controls), 1))]
+    for pose in poses[1:]:
         # Newton's method for y and the joints, from the place before.
-        place = curves[:, k - 1].copy()
-        place[:, [0, 2]] = poses[:, k]
+        place = curves[-1].copy()
+        place[:, [0, 2]] = pose
         for _ in range(6):
             gaps, rows = constrain(formation, place)
             rows = rows[:, :, [1, 3, 4]]
@@ -529,8 +517,8 @@ def bend(formation: Formation, z: Array, controls: Array) -> Array:
             rows[flat] = np.eye(3)
             step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
             place[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
-        curves[:, k] = place
-    return curves
+        curves.append(place)
+    return np.stack(curves, axis=1)
 
 
 def inside(formation: Formation, z: Array) -> Flags:
@@ -552,14 +540,3 @@ def _find_margin(formation: Formation, epsilon: float, z: Array) -> float:
     s = np.append(0.0, np.cumsum(runs))
     margin = fast_margin(formation, epsilon, (s, z, np.gradient(z, s, axis=0, edge_order=2)))
     return float(np.nan_to_num(margin, nan=-np.inf))
-
-
-def _end_equations(phase: Phase, z: Array) -> tuple[Array, Array]:
-    """What is missing to contacts and end at one configuration, and its rows."""
-    (gaps,), (rows,) = constrain(phase.formation, z[None])
-    places, contact = dict(phase.until.poses), phase.until.contact
-    if contact is not None:
-        touch = locate(phase.formation.scene, contact.name, z[None])
-        gaps, rows = np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
-    missing = [z[k] - value for k, value in places.items()]
-    return np.append(gaps, missing), np.vstack([rows, np.eye(5)[[*places]]])

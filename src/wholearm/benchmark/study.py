@@ -135,10 +135,10 @@ def run_study(
             ahead = (time.monotonic() - wall_start) / count * (len(left) - count) / 60
             text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
             progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
-    named = (
-        dict(zip(study.keys, case, strict=False)) | {"name": name_case(case)} for case in cases
-    )
-    rows = [name | done[json.dumps(case)] for name, case in zip(named, cases, strict=True)]
+    rows = [
+        dict(zip(study.keys, case, strict=False), name=name_case(case)) | done[json.dumps(case)]
+        for case in cases
+    ]
     good = [row for row in rows if "failed" not in row]
     parts, violations = study.report(good, options)
     findings = [f"{row['name']}: {row['failed']}" for row in rows if "failed" in row]

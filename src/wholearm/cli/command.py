@@ -36,7 +36,7 @@ from ..common.errors import (
 )
 from ..common.fields import Range, choice, keys_of, read_options
 from ..common.files import READ, number_same, require_ending, require_writable, together, write_text
-from ..common.signals import listen, on_end
+from ..common.signals import listen, register_cleanup
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
 
@@ -65,15 +65,16 @@ PROBLEM = "problem  problem file (TOML)\n"
 PLAN = "plan  trajectory file (.npz)\n"
 JSON = "--json  print the result as JSON\n"
 SQUEEZE = """\
---squeeze  of quasistatic torques: 0 as little as needed, 1 as hard as helps = 0.5 in 0.0..1.0
+--squeeze  internal force of quasistatic torques: 0 least, 1 with the largest least normal force
+    = 0.5 in 0.0..1.0
 """
 POLICY = """\
---policy FILE  torques by this policy (.npz), at its own period, instead of the plan's by the clock
+--policy FILE  feedback torques by this policy (.npz), at its period, instead of the plan's
 """
-SENSOR = "--sensor  with --policy: measured normal forces are handed to it, exact ones\n"
+SENSOR = "--sensor  with --policy: the policy gets exact normal forces\n"
 SEARCH = """\
---cache DIR       folder to keep what is found out of the scene, for later searches for a goal
-    (none); nobody else may write there
+--cache DIR       folder for results about the scene, for later searches for a goal (none); nobody
+    else may write there
 --jobs N          processes of a search for a [goal] (2, or 1 where there is one core) in 1..256
 --time-limit S    longest time that this may take; a search then returns the best route so far
     (none) in 1e-3..1e9
@@ -84,7 +85,7 @@ PLANNING = re.sub(r"^--samples .*\n", "", PLANNER, flags=re.M) + MARGIN
 OBJECTIVE = PLANNING[: PLANNING.index("--accuracy")]
 
 TABLE = f"""\
-[[new]]  write a problem file to begin with
+[[new]]  write a first problem file
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 (7) in 3..50
 --size             from its centre to its corners [m] (0.05) in 1e-6..1e6
@@ -104,12 +105,12 @@ name               the problem's name; NAME.toml is written
 {PROBLEM}\
 torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
---departure       how far the replay may be from the plan, over the object's radius of gyration, and
-    in rad (1e-3) in 1e-9..1e3
---rest-speed      speed that passes for rest, over sqrt(that radius times g) (2e-2) in 1e-9..1e3
+--departure       largest distance of the replay from the plan, over the object's radius of
+    gyration, and in rad (1e-3) in 1e-9..1e3
+--rest-speed      largest speed of rest, over sqrt(that radius times g) (2e-2) in 1e-9..1e3
 {MARGIN}\
 --reduced         also list the paper's scalar equation of motion where a phase has four constraints
---free            simulate without given contacts: whole, and a plan's phases one by one
+--free            simulate without prescribed contacts: whole, and a plan's phases one by one
 --policy FILE     with --free: torques by this policy (.npz) instead of the plan's
 {SENSOR}\
 --restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
@@ -119,27 +120,27 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
---simulate [told|free]  overlay the simulated forces; told: of the given contacts, as without a
-    word; free: without given contacts among told|free
+--simulate [told|free]  overlay the simulated forces; told (default): with prescribed contacts;
+    free: without them among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
-[[predict]]  see up to which speed slow motions keep every contact
+[[predict]]  find the speeds up to which motions along the phases keep every contact
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
---torques FILE    write the quasistatic torques as CSV, which hand tuning starts from
---speed V         mean speed at which these go along the phases [m/s] (0.05) in 1e-9..1e6
+--torques FILE    write the quasistatic torques as CSV, a first guess for hand tuning
+--speed V         with --torques: mean speed along the phases [m/s] (0.05) in 1e-9..1e6
 {JSON}\
 [[tune]]  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
---stops N         with --brake: let a phase that fails stop up to N times on its way = 0 in 0..7
+--stops N         with --brake: let a phase that fails stop up to N times on its path = 0 in 0..7
 {SQUEEZE}\
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
 {JSON}\
-[[compare]]  put plans and torques for a problem side by side
+[[compare]]  compare plans and torques for a problem by their replays
 {PROBLEM}\
 files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 -o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
@@ -147,8 +148,8 @@ files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 [[route]]  find the contact formations that lead to a goal, and plan
 problem           problem file (TOML) with [goal] in place of [[phases]]
 -o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
---alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
---objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
+--alternatives N  number of routes of other formations to list with the best one = 0 in 0..100
+--objective NAME  of the plans: time, effort or margin; routes are searched by time = time
 {SEARCH}{JSON}\
 [[map]]  draw the contact formations over (x, phi)
 {PROBLEM}\
@@ -169,28 +170,28 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 {POLICY}\
 --step            longest time step [s] (from the scene) in 1e-15..1e6
 --softness        of contacts, over the default, which is proportional to the step (1) in 1e-6..1e6
---departure       how far a replay may be from the plan, over the object's radius of gyration, and
-    in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 1e-2) in 1e-9..1e3
+--departure       largest distance of a replay from the plan, over the object's radius of gyration,
+    and in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 1e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
 {JSON}\
-[[policy]]  make torques a function of the joints, by feedback
+[[policy]]  make a feedback policy: torques as a function of joint angles and speeds
 {PLAN}\
 -o --output FILE  policy to write (.npz; default: NAME_policy.npz)
---reserve         normal force that is kept in reserve along the way: where plan or problem have
-    ranges of numbers, for so many times these (1); otherwise over what usual errors of masses,
-    friction and torques take away (2.5); 0 is as fast as the plan in 0.0..1e3
+--reserve         robustness margin of normal forces along the path: if plan or problem have ranges
+    of numbers, a factor on these (1); otherwise over the changes by usual errors of masses,
+    friction and torques (2.5); 0 is as fast as the plan in 0.0..1e3
 --period          of the control loop [s] = 1e-3 in 1e-5..10
 --delay           time from measuring to when torques take effect [s] = 5e-4 in 0.0..10
 --contact-speed   at which contacts are made, over the usual speed; times at rest before the next
     phase begins are longer by its inverse square (the largest of 1, 0.5 and 0.25 that keeps all
     contacts in its simulation) in 1e-3..10
 --torque-limit    of both fingers, if more than the plan's [N m] (the same) in 1e-12..1e12
---largest         also look for how many times as wide ranges a policy can keep contacts in
---departure       how far contacts may open in its simulation, over the object's radius of gyration
-    (1e-3) in 1e-9..1e3
---write-anyway    write the policy although its simulation does not hold, marked so in its file
+--largest         also find the largest factor on the ranges with which a policy keeps contacts
+--departure       largest opening of contacts in its simulation, over the object's radius of
+    gyration (1e-3) in 1e-9..1e3
+--write-anyway    write the policy although its simulation fails; its file has a mark of that
 {JSON}\
-[[robustness]]  see how much error a plan bears
+[[robustness]]  simulate a plan under random errors and count the samples that succeed
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808
@@ -198,52 +199,52 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 {POLICY}{SENSOR}\
 --vary NAME=WIDTH ...  half widths of ranges, instead of the problem's: mass, inertia (0.05),
     friction (0.1), gain of the torques (0.01), all relative; geometry, start_x [m] (6e-3 radii of
-    gyration), delay (1e-3 s); 0 leaves a number as it is
+    gyration), delay (1e-3 s); 0: no change of a number
 --sample-rate HZ      of a sample-and-hold of torques [Hz], 0 as planned = 1000 in 0.0..1e6
 --tolerance           of the simulations, relative to the scene's scales = 1e-6 in 1e-14..1e-2
---goal-distance M     how far from the plan's end the goal counts as reached [m] (0.03 radii of
-    gyration) in 1e-9..1e6
---goal-angle DEG      and how far from its angle [degrees] = 1 in 1e-9..360
+--goal-distance M     largest distance from the plan's end at the goal [m] (0.03 radii of gyration)
+    in 1e-9..1e6
+--goal-angle DEG      largest difference from its angle at the goal [degrees] = 1 in 1e-9..360
 -o --output FILE      file to write results to, one by one (default: NAME_robustness.jsonl, with
-    phase and policy in the name); a study that is there goes on where it was stopped
---fresh               begin the file anew, whatever it holds
+    phase and policy in the name); a study in it is continued
+--fresh               overwrite the file
 --figure FILE         also draw the motion with its noisy copies (.png, .pdf, .svg)
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
 {JSON}\
-[[sweep]]  plan a grid of other values of the numbers in problem files
+[[sweep]]  plan problem files for a grid of values of their numbers
 problems PROBLEM ...   problem files (TOML)
---vary NAME=VALUES ...  what is varied, by the names of Problem.with_: LOW:HIGH:COUNT, or
+--vary NAME=VALUES ...  numbers to vary, by the names of Problem.with_: LOW:HIGH:COUNT, or
     VALUE,VALUE,... of numbers or words, as in torque_limit=1:3:5 phases[5].until.phi_deg=-50,-45;
     LOW:HIGH with --samples
 --samples N            points of a Latin hypercube in place of the grid = 0 in 0..1000000
 --seed K               of the samples = 0 in 0..9223372036854775808
---with CHECKS          what plans are tried with: verify, free, policy, or several with commas
--o --output FILE       table to write (.csv; default: NAME_sweep_PARAMETERS.csv). Rows are kept in
-    a .jsonl file beside it as they come; a sweep that is there goes on where it was stopped
---fresh                begin these files anew, whatever they hold
+--with CHECKS          simulations of plans: verify, free, policy, or several with commas
+-o --output FILE       table to write (.csv; default: NAME_sweep_PARAMETERS.csv). Rows are stored
+    one by one in a .jsonl file beside it; a sweep in it is continued
+--fresh                overwrite these files
 --figure FILE          also draw (.png, .pdf, .svg) a curve over one parameter, contours over two,
     small multiples over three
 --jobs N               worker processes (default: all cores) in 1..256
 --scheduler ADDRESS    run on the cluster of this Dask scheduler (extra: cluster)
 --time-limit S         longest time for one point (none) in 1e-3..1e9
 {PLANNING}{JSON}\
-[[sensitivities]]  see what 1 percent more of each number in a problem file is worth
+[[sensitivities]]  find derivatives of a plan's objective by each number in a problem file
 problem            problem file (TOML)
-[plan]             trajectory file (.npz) of its plan, whose objective and options count
+[plan]             trajectory file (.npz) of its plan, whose objective and options are used
 --of NAME ...      these numbers alone, by the names of Problem.with_ (default: all but corners)
---differences      between solved problems, also where multipliers give derivatives
+--differences      differences of solved problems, also if multipliers give derivatives
 -o --output FILE   figure to write (.png, .pdf, .svg): a bar for each number
 --jobs N           processes (default: all cores) in 1..256
 {PLANNING}{JSON}\
-[[design]]  find the hand that does a job best
+[[design]]  optimize numbers of the hand for one or several problems
 problems PROBLEM ...   problem files (TOML), for one hand
 --over NAME=LOW:HIGH ...  numbers to choose and their ranges, by the names of Problem.with_, as in
     length1=0.1:0.25 base1_x=0.06:0.1 (required)
 --minimise NAME        time, effort or -margin = time among time|effort|-margin
---symmetric            let what is said of one finger hold for the other, mirrored
+--symmetric            numbers of one finger hold for the other, mirrored
 --weights W ...        weights of several problems (equal ones) in 1e-6..1e6
---worst                of several problems let the worst one count, and not the weighted sum
+--worst                minimize the largest value of several problems, not the weighted sum
 --starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
 --budget N             most hands of a search, and before its first feasible one = 80 in 1..100000
 -o --output FILE       problem file to write (.toml; default: NAME_design.toml); of several problems
@@ -255,23 +256,23 @@ problems PROBLEM ...   problem files (TOML), for one hand
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html for any browser (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
---simulate [told|free]  draw the simulated motion behind; told: with the given contacts, as without
-    a word; free: without given contacts among told|free
-[[report]]  put a problem and its plans into one page to open anywhere
+--simulate [told|free]  draw the simulated motion behind; told (default): with prescribed contacts;
+    free: without them among told|free
+[[report]]  write a page of HTML about a problem and its plans
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
 -o --output FILE  page to write (default: NAME.html)
---sensitivities   also show what 1 percent more of each number of the problem is worth
+--sensitivities   also show the effect of 1 percent more of each number of the problem
 [[gallery]]  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md), with a folder of pictures beside it = results/gallery.md
 [[help]]  print a page of the documentation, or list its topics
-[topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
-[[completion]]  print what makes a shell complete all this
+[topic TOPIC]  topic of the page (left out: list the topics) among {"|".join(TOPICS)}
+[[completion]]  print a completion script of a shell
 shell  bash, zsh or tcsh; needs the extra completion
 """
-"""Commands but `bench`: name, what it is for, and then its files and options as of `read_options`.
-The function of its name, after an underscore, carries a command out."""
+"""Commands without `bench`: name, purpose, then files and options in the form of `read_options`.
+A command is run by the function with its name after an underscore."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -281,10 +282,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except OSError as error:
-        # Files are written elsewhere, with errors of their own; this is the output.
+        # An error of the output: files have other errors.
         if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
-        # The interpreter would complain again, when it exits, about what cannot be written.
+        # At its exit the interpreter would complain again about the output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if error.errno != errno.EPIPE:
             _complain(f"standard output: cannot be written: {error.strerror}")
@@ -292,12 +293,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    """Run a command; its error is a line on stderr, and with `--json` an object on stdout, too."""
+    """Run a command; errors are lines on stderr, and with `--json` also objects on stdout."""
     options = argparse.Namespace()
     try:
         options = build_parser(words).parse_args(words)
-        for given in (getattr(options, name) for name in options.inputs):
-            paths = given if isinstance(given, list) else [given]
+        for value in (getattr(options, name) for name in options.inputs):
+            paths = value if isinstance(value, list) else [value]
             READ.update(map(os.path.realpath, filter(None, paths)))
         if not sys.stderr.isatty():
             _LINES.begin(os.getpid())
@@ -321,18 +322,18 @@ def _complain(text: str) -> None:
         clear_progress()
         print(f"wholearm: {text}", file=sys.stderr, flush=True)
     except OSError:
-        pass  # nobody reads it
+        pass  # stderr is closed
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are ours; -margin and numbers with a minus before are no options."""
+    """A parser whose errors are `InputError`; -margin and negative numbers are no options."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._negative_number_matcher = re.compile(r"-(\.?\d|margin$)")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; a command refuses what it does not know in its own name."""
+        """Parse; errors of unknown arguments have the name of the command."""
         parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -344,17 +345,17 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
-    """Add the parser of a command or study: what it is for, options and files (`read_options`)."""
+    """Add the parser of a command or study: purpose, options and files (`read_options`)."""
     title = f"{text[0].upper()}{text[1:]}."
     parser: Parser = parsers.add_parser(name, help=text, description=title)
-    actions = [parser.add_argument(*each.flags, **each.arguments) for each in read_options(table)]
-    named = [action for action in actions if action.dest in INPUTS and not action.type]
-    parser.set_defaults(inputs=[a.dest for a in named if "--torques" not in a.option_strings])
+    actions = [parser.add_argument(*o.flags, **o.arguments) for o in read_options(table)]
+    files = [action for action in actions if action.dest in INPUTS and not action.type]
+    parser.set_defaults(inputs=[a.dest for a in files if "--torques" not in a.option_strings])
     return parser
 
 
-def build_parser(given: Sequence[str] | None = None) -> Parser:
-    """The parser of all commands; options are those of the one alone that is given, if any."""
+def build_parser(words: Sequence[str] | None = None) -> Parser:
+    """The parser of all commands; with `words`, only the command in these has its options."""
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     version = f"wholearm {wholearm.__version__}"
     parser.add_argument("--version", action="version", version=version, help="print the version")
@@ -362,19 +363,19 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
     for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
         head, _, table = part.partition("\n")
         name, text = head.removeprefix("[[").split("]]  ")
-        asked = given is None or name in given[:1]
-        subparser = add_parser(commands, name, text, table if asked else "")
+        selected = words is None or name in words[:1]
+        subparser = add_parser(commands, name, text, table if selected else "")
         subparser.set_defaults(run=globals()[f"_{name}"])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
     bench.set_defaults(run=_list_studies)
-    if given is None or given[:1] == ["bench"]:
-        # They are imported when they are used.
+    if words is None or words[:1] == ["bench"]:
+        # Studies are imported when they are used.
         from ..benchmark import STUDIES
 
         studies = bench.add_subparsers(metavar="STUDY")
         for name, text in STUDIES.items():
-            if given is None or name in given[1:2]:
+            if words is None or name in words[1:2]:
                 study = load_study(name)
                 subparser = add_parser(studies, name, text, study.list_options())
                 subparser.set_defaults(run=partial(_run_study, study))
@@ -383,56 +384,56 @@ def build_parser(given: Sequence[str] | None = None) -> Parser:
     return parser
 
 
-def prepare(given: Sequence[str]) -> list[str]:
-    """Arguments as argparse takes them: `--simulate` with its simulator, `--list` without a sign.
+def prepare(words: Sequence[str]) -> list[str]:
+    """Arguments for argparse: `--simulate` with its simulator, `--list` without an equals sign.
 
-    It would take a file for the simulator that is left out, which is `told`, and of several pairs
-    one alone after an equals sign.
+    argparse would use a file after `--simulate` as simulator, in place of the default `told`, and
+    only one pair after `--list=`.
     """
-    left, texts = [*given], list[str]()
-    while left:
-        text = left.pop(0)
+    queue, texts = [*words], list[str]()
+    while queue:
+        text = queue.pop(0)
         if text == "--simulate":
-            word = left and re.fullmatch(r"\w+", left[0]) and not os.path.exists(left[0])
-            text += f"={left.pop(0) if word else 'told'}"
+            word = queue and re.fullmatch(r"\w+", queue[0]) and not os.path.exists(queue[0])
+            text += f"={queue.pop(0) if word else 'told'}"
         texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
     return texts
 
 
-EVERY = 10.0  # time between lines of progress where stderr is no terminal [s]
+LOG_INTERVAL = 10.0  # time between lines of progress where stderr is no terminal [s]
 
 
 class _Lines:
-    """Lines for a log: what is being done, for how long already."""
+    """Lines on progress for a log, with the elapsed time."""
 
     def __init__(self) -> None:
-        listen(self.look)
+        listen(self.print_if_due)
         self.begin(0)
 
     def begin(self, process: int) -> None:
-        """Count from now on, for the work of a process."""
+        """Start the clock of the work of a process."""
         self._process, self.text = process, "working"
-        self._begun = self._last = time.monotonic()
+        self._start = self._last = time.monotonic()
 
-    def look(self) -> None:
-        """Print what was said last, if it is time."""
+    def print_if_due(self) -> None:
+        """Print the last text, if the interval is over."""
         now = time.monotonic()
-        # A forked process has the same work, whose progress its parent tells.
-        if now - self._last >= EVERY and os.getpid() == self._process:
+        # Progress of a forked process is printed by its parent.
+        if now - self._last >= LOG_INTERVAL and os.getpid() == self._process:
             self._last = now
-            _complain(f"{now - self._begun:.0f} s: {self.text}")
+            _complain(f"{now - self._start:.0f} s: {self.text}")
 
 
-_LINES = _Lines()  # those of the command, which may show progress of several things
+_LINES = _Lines()  # of the command, for progress of several tasks
 
 
 def show_progress(text: str) -> None:
-    """Show what is done: a line that changes in a terminal, and else one every ten seconds."""
+    """Show progress: a line that changes in a terminal, or else one every ten seconds."""
     if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
     else:
         _LINES.text = text
-        _LINES.look()
+        _LINES.print_if_due()
 
 
 def clear_progress() -> None:
@@ -441,18 +442,18 @@ def clear_progress() -> None:
         show_progress("")
 
 
-on_end(clear_progress)
+register_cleanup(clear_progress)
 
 
 def require_output(path: str | None, *endings: str) -> None:
-    """Check, before long work, that a file can be written; without endings it is a figure."""
+    """InputError, before long work, if a file cannot be written; by default it is a figure."""
     if path is not None:
         require_writable(path)
         require_ending(path, *(endings or (".png", ".pdf", ".svg")))
 
 
 def finish(options: argparse.Namespace, result: Result | None, *paths: str | None) -> int:
-    """Print a result as text or JSON with notes, and files that are written; the exit status."""
+    """Print a result as text or JSON with notes, and names of written files; the exit status."""
     clear_progress()
     as_json = getattr(options, "json", False)
     if result is not None and as_json:
@@ -466,20 +467,20 @@ def finish(options: argparse.Namespace, result: Result | None, *paths: str | Non
 
 
 def refuse(options: argparse.Namespace, problem: str, *names: str) -> None:
-    """Refuse the first of some options that is given, saying why; a switch that is off is not."""
+    """InputError, with the problem, of the first of some options that is set."""
     for name in names:
         if getattr(options, name) is not None and getattr(options, name) is not False:
             raise InputError("", f"--{name.replace('_', '-')}", problem)
 
 
-def require_with(options: argparse.Namespace, needed: str, *names: str) -> None:
-    """Check that an option is given, or else none of those that need it."""
-    if getattr(options, needed) in (None, False):
-        refuse(options, f"needs --{needed.replace('_', '-')}", *names)
+def require_with(options: argparse.Namespace, required: str, *names: str) -> None:
+    """InputError if an option is not set, but another one that needs it."""
+    if getattr(options, required) in (None, False):
+        refuse(options, f"needs --{required.replace('_', '-')}", *names)
 
 
 def list_given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Options that are given, of those with some names."""
+    """Options with these names that are set."""
     values = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -493,11 +494,11 @@ def save_figure(path: str | None, function: str, result: Result) -> None:
 
 
 def choose_workers(options: argparse.Namespace) -> Callable[[], Executor]:
-    """What starts the processes of a study, on a cluster if its scheduler is given."""
+    """Function that starts the processes of a study, or connects to its cluster."""
     from ..common.parallel import Processes, connect
 
     if options.scheduler is not None:
-        client = connect(options.scheduler)  # before any file is begun
+        client = connect(options.scheduler)  # before any file is written
         return lambda: client
     return partial(Processes, options.jobs)
 
@@ -515,11 +516,11 @@ LoadedPlan = tuple["wholearm.Problem", "wholearm.Trajectory", "wholearm.Policy |
 def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     """The problem with the phases of a plan, the plan, and its policy if any.
 
-    What was made for another problem is printed, or kept where JSON or phases are. InputError, with
-    the file, if a plan or policy makes no sense here.
+    Notes on plans for another problem are printed, or stored if the output is JSON or phases.
+    InputError, with the file, if a plan or policy cannot be used for the problem.
     """
     from ..problem.read import adopt_phases
-    from ..results.adopt import describe_origin
+    from ..results.adopt import describe_origin, require_same_contacts
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
     policy_path, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
@@ -527,6 +528,8 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
         policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
         origins.append(("policy", policy_path, policy.about))
     problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
+    with name_source(path):
+        require_same_contacts(problem, plan)
     for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
@@ -571,7 +574,7 @@ def _solve(options: argparse.Namespace) -> int:
             sampling = options.sample_rate, interpolation
             table = make_table(plan.problem, plan.trajectory, options.replay, *sampling)
     except WholearmError as error:
-        # Of bad input one line says everything.
+        # Bad input needs no further line.
         for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
             if os.path.exists(path):
                 _complain(f"{path}: left as it was, from an earlier run")
@@ -606,7 +609,7 @@ def _verify(options: argparse.Namespace) -> int:
     else:
         problem, torques = read_problem(options), wholearm.read_torque_csv(options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
-        # What has been planned or replayed can be carried out.
+        # Only problems that have been neither planned nor replayed may be impossible.
         from ..geometry.tracing import check_phases
 
         check_phases(problem)
@@ -628,7 +631,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _is_table(path: str) -> bool:
-    """Whether a file is one of torques alone, and no trajectory."""
+    """Whether a file has torques alone, and no trajectory."""
     return require_ending(path, ".npz", ".csv") == ".csv"
 
 
@@ -636,33 +639,33 @@ def _plot(options: argparse.Namespace) -> int:
     require_output(options.output)
     if not _is_table(options.trajectory):
         trajectory = wholearm.load_trajectory(options.trajectory)
-        moved: wholearm.Simulation | wholearm.Trajectory = trajectory
+        motion: wholearm.Simulation | wholearm.Trajectory = trajectory
         refuse(options, "is for torques (.csv); trajectories bring their own", "problem")
     else:
         torques = wholearm.read_torque_csv(options.trajectory)
         if options.problem is None:
             raise InputError(options.trajectory, "--problem", "is needed to replay torques")
         problem = wholearm.load(options.problem)
-        # Steps alone are too far apart for smooth curves; a figure is some 1000 points wide.
-        how: Any = {"times": [k / 1000 * torques.breaks[-1] for k in range(1001)], "minima": True}
-        moved = wholearm.simulate(problem, torques, **how, progress=show_progress)
-        trajectory = moved.trajectory
+        # Steps of the simulator are too long for smooth curves; a figure has about 1000 points.
+        rows: Any = {"times": [k / 1000 * torques.breaks[-1] for k in range(1001)], "minima": True}
+        motion = wholearm.simulate(problem, torques, **rows, progress=show_progress)
+        trajectory = motion.trajectory
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory)
         figure = wholearm.plots.force_margins(
-            moved, simulation=simulation, motion=options.motion, **list_given(options, "width")
+            motion, simulation=simulation, motion=options.motion, **list_given(options, "width")
         )
     wholearm.plots.save(figure, options.output)
     return finish(options, None, options.output)
 
 
 def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> wholearm.Simulation | None:
-    """Simulate the torques of a trajectory; `simulator` is told or free, or None for nothing."""
+    """Simulation of the torques of a trajectory by a simulator, told or free; None without one."""
     if simulator is None:
         return None
-    from ..problem.read import read_own_problem
+    from ..problem.read import read_stored_problem
 
-    problem = read_own_problem(trajectory.meta)
+    problem = read_stored_problem(trajectory.meta)
     if simulator == "free":
         show_progress("simulating the whole")
         free = wholearm.simulate_free(problem, trajectory, times=trajectory.t)
@@ -681,7 +684,7 @@ def _predict(options: argparse.Namespace) -> int:
     prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress)
     save_figure(options.output, "draw_prediction", prediction)
     if not options.json:
-        finish(options, prediction)  # of use where there are no torques to write, too
+        finish(options, prediction)  # also if there are no torques to write
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
     finish(options, prediction if options.json else None, options.output, options.torques)
@@ -707,9 +710,9 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _robustness(options: argparse.Namespace) -> int:
-    from ..problem.definition import spread_widths
+    from ..problem.definition import expand_widths
 
-    # A file for each study that differs by more than numbers: its problem, phase and policy.
+    # Studies of other problems, phases and policies have other files.
     parts = [Path(options.problem).stem, "robustness"]
     parts += [] if options.phase is None else [f"phase{options.phase}"]
     parts += [] if options.policy is None else [Path(options.policy).stem]
@@ -729,7 +732,7 @@ def _robustness(options: argparse.Namespace) -> int:
         except ValueError:
             fault = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1, and each name once"
             raise InputError("", "--vary", fault) from None
-    ranges = problem.ranges | spread_widths(widths, "--vary {}")
+    ranges = problem.ranges | expand_widths(widths, "--vary {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
     trials = wholearm.Uncertainty(ranges, options.sample_rate or None, options.tolerance, *goal)
     study = wholearm.assess_robustness(
@@ -745,7 +748,7 @@ def _robustness(options: argparse.Namespace) -> int:
     save_figure(options.figure, "draw_robustness", study)
     status = finish(options, study, options.figure)
     if not options.json:
-        print(f"results: {output}")  # of earlier runs, too, or of these alone
+        print(f"results: {output}")  # also of earlier runs
     return status
 
 
@@ -764,7 +767,7 @@ def _route(options: argparse.Namespace) -> int:
 def find_route(
     options: argparse.Namespace, problem: wholearm.Problem, alternatives: int = 0
 ) -> wholearm.Answer:
-    """Find a route, with a progress line, in two processes if nothing else is asked for."""
+    """Find a route, with a progress line, in two processes by default."""
     from ..common.parallel import count_cores
 
     def warn(message: Warning | str, *_: object, **__: object) -> None:
@@ -784,7 +787,7 @@ def find_route(
 
 
 def hasten() -> None:
-    """Say that the best route so far is being planned."""
+    """Print that the best route so far is being planned."""
     _complain("planning the best route; again to stop")
 
 
@@ -798,8 +801,8 @@ def _save_map(
     from ..mapping.formation_map import choose_window
 
     window = choose_window(problem, phi)
-    chart = wholearm.build_map(problem, window=window, progress=show_progress, **limit)
-    wholearm.plots.save(wholearm.draw_map(chart, plan), output)
+    formation_map = wholearm.build_map(problem, window=window, progress=show_progress, **limit)
+    wholearm.plots.save(wholearm.draw_map(formation_map, plan), output)
     clear_progress()
 
 
@@ -809,8 +812,8 @@ def _map(options: argparse.Namespace) -> int:
     if phi and not 0 < phi[1] - phi[0] <= 360:
         raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
     output = options.output or f"map_{Path(options.problem).stem}.png"
-    drawn = options.output is not None or not poses
-    if drawn:
+    draws = options.output is not None or not poses
+    if draws:
         require_output(output)
     problem, plan = read_problem(options), None
     if options.plan is not None:
@@ -818,7 +821,7 @@ def _map(options: argparse.Namespace) -> int:
     if poses:
         radians = [(x, math.radians(angle)) for x, angle in poses]
         print(wholearm.format_route(wholearm.list_formations(problem, *radians)), end="")
-    if drawn:
+    if draws:
         _save_map(problem, plan, output, phi, **list_given(options, "uniqueness_margin"))
         print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
     return 0
@@ -833,7 +836,7 @@ def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
 
 
 def _check_step(options: argparse.Namespace, problem: wholearm.Problem) -> None:
-    """Check that an engine gets along with the time step, if one is given."""
+    """InputError if the time step is out of the range of an engine."""
     step_range = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
     if options.step is not None:
         step_range.check("--step", options.step, "s", problem.scene)
@@ -886,34 +889,34 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _policy(options: argparse.Namespace) -> int:
     from ..planning.plan import plan_anew
-    from ..policy.make import find_widest
-    from ..problem.read import read_own_problem
+    from ..policy.make import find_largest_factors
+    from ..problem.read import read_stored_problem
     from ..verification.free import CONTACT_SPEEDS, find_policy
 
     output = options.output or f"{Path(options.plan).stem}_policy.npz"
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
-    problem = read_own_problem(plan.meta, options.plan)
+    problem = read_stored_problem(plan.meta, options.plan)
     planner = partial(plan_anew, progress=show_progress)
     names = "reserve", "period", "delay", "torque_limit", "contact_speed", "departure"
     values = list_given(options, *names) | {"planner": planner}
 
     def advise() -> str:
-        """Which of a faster loop, half the reserve, and more force would do."""
+        """Advice: a faster loop, half the reserve, or a larger epsilon, whichever succeeds."""
         period, epsilon = min(2e-4, options.period), 2 * problem.epsilon
-        usual = 2.5 if problem.uncertainty is None else 1.0
-        reserve = (usual if options.reserve is None else options.reserve) / 2
-        firm = problem.with_({"epsilon": epsilon})
+        default = 2.5 if problem.uncertainty is None else 1.0
+        reserve = (default if options.reserve is None else options.reserve) / 2
+        pressing = problem.with_({"epsilon": epsilon})
         trials: list[tuple[str, wholearm.Problem, dict[str, Any]]] = [
             (f"--period {period:g} --delay 0", problem, {"period": period, "delay": 0.0}),
             (f"--reserve {reserve:g}", problem, {"reserve": reserve}),
-            (f"a plan with epsilon = {epsilon:g} N", firm, {}),
+            (f"a plan with epsilon = {epsilon:g} N", pressing, {}),
         ]
         for words, scene, changes in trials:
             show_progress(f"trying {words}")
             with suppress(WholearmError):
-                tried = plan if scene is problem else planner(scene)
-                if find_policy(scene, tried, **({"contact_speed": 1.0} | values | changes))[1].ok:
+                motion = plan if scene is problem else planner(scene)
+                if find_policy(scene, motion, **({"contact_speed": 1.0} | values | changes))[1].ok:
                     return f"{words} would do"
         speeds = () if "contact_speed" in values else CONTACT_SPEEDS[1:]
         texts = [f"--contact-speed {speed:g}" for speed in speeds]
@@ -922,33 +925,33 @@ def _policy(options: argparse.Namespace) -> int:
 
     with name_source(options.plan):
         show_progress("making and simulating the policy")
-        made, report = find_policy(problem, plan, **values)
+        policy, report = find_policy(problem, plan, **values)
         if options.largest:
             show_progress("looking for the widest ranges")
-            each = find_widest(problem, plan, options.delay)
-            made.about["largest"] = {str(number): factor for number, factor in each.items()}
+            factors = find_largest_factors(problem, plan, options.delay)
+            policy.about["largest"] = {str(number): factor for number, factor in factors.items()}
     failures = "; ".join(report.failures)
     if not report.ok and options.write_anyway:
-        # The mark by which a program, or a reader of the file, knows.
-        made.about["failures"] = list(report.failures)
+        # Mark of a failed policy in its file.
+        policy.about["failures"] = list(report.failures)
         _complain(f"warning: {output}: written although in the free simulation, {failures}")
     elif not report.ok:
-        opened = [loss.gap for phase in report.phases for loss in phase.losses]
-        enough = ""
-        if len(opened) == len(report.failures):
-            # Nothing but openings: rounded up to two digits.
-            share = f"{1.05 * max(opened) / problem.scene.scales.length:.2g}"
-            enough = f"--departure {share} allows that; "
+        gaps = [loss.gap for phase in report.phases for loss in phase.losses]
+        hint = ""
+        if len(gaps) == len(report.failures):
+            # Openings alone: the largest one, rounded up to two digits.
+            departure = f"{1.05 * max(gaps) / problem.scene.scales.length:.2g}"
+            hint = f"--departure {departure} allows that; "
         raise ReplayError(
             f"{options.plan}: no policy is written: in the free simulation, {failures}; "
-            f"{enough}{advise()}; --write-anyway writes it all the same"
+            f"{hint}{advise()}; --write-anyway writes it all the same"
         )
     if report.warnings:
-        made.about["warnings"] = list(report.warnings)
-    made.save(output)
-    status = finish(options, made)
+        policy.about["warnings"] = list(report.warnings)
+    policy.save(output)
+    status = finish(options, policy)
     if not options.json:
-        print(f"{made.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
+        print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return status
 
 
@@ -968,11 +971,11 @@ def _sweep(options: argparse.Namespace) -> int:
 
         choose_axes(vary, options.samples, len(options.problems))
     # Here `samples` are points, not rows of a trajectory.
-    given = list_given(options, "seed", "time_limit", "fresh", *keys_of(wholearm.PlanOptions))
+    values = list_given(options, "seed", "time_limit", "fresh", *keys_of(wholearm.PlanOptions))
     result = wholearm.sweep(
         [read_problem(path) for path in options.problems],
         vary,
-        **given,
+        **values,
         checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
         path=f"{os.path.splitext(output)[0]}.jsonl" if require_ending(output, ".csv") else None,
         start=choose_workers(options),
@@ -1030,12 +1033,12 @@ def _gallery(options: argparse.Namespace) -> int:
 
 
 def _animate(options: argparse.Namespace) -> int:
-    from ..problem.read import read_own_problem
+    from ..problem.read import read_stored_problem
 
     require_output(options.output, ".gif", ".mp4", ".html")
     trajectory = wholearm.load_trajectory(options.trajectory)
     with name_source(options.trajectory):
-        problem = read_own_problem(trajectory.meta)
+        problem = read_stored_problem(trajectory.meta)
         simulation = overlay(options.simulate, trajectory)
         ghost = None if simulation is None else simulation.trajectory
         if options.output.lower().endswith(".html"):
@@ -1046,8 +1049,8 @@ def _animate(options: argparse.Namespace) -> int:
         else:
             from ..viewer.movie import write_movie
 
-            how: Any = {"speed": options.speed, "progress": show_progress}
-            write_movie(options.output, problem, trajectory, ghost, **how)
+            settings: Any = {"speed": options.speed, "progress": show_progress}
+            write_movie(options.output, problem, trajectory, ghost, **settings)
     return finish(options, None, options.output)
 
 
@@ -1110,7 +1113,7 @@ def _completion(options: argparse.Namespace) -> int:
 
 
 def _complete_files(parser: Parser, files: object, folders: object) -> None:
-    """Let all arguments that name files or folders be completed so."""
+    """Set the completion of all arguments that are names of files or folders."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for subparser in action.choices.values():
@@ -1159,7 +1162,7 @@ def _schema(options: argparse.Namespace) -> int:
 
 
 def load_study(name: str) -> Study:
-    """The study of a name."""
+    """The study with a name."""
     study: Study = import_module(f"wholearm.benchmark.{name}").STUDY
     return study
 

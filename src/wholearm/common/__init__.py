@@ -1,1 +1,1 @@
-"""What every other package may use: errors, files, locks and caches, interrupts."""
+"""Utilities of all other packages: errors, files, locks and caches, interrupts."""

@@ -18,39 +18,39 @@ _P = ParamSpec("_P")
 _BUILT_IN: dict[str, type] = {"None": type(None), "str": str, "Path": os.PathLike}
 
 
-def _fits(given: Any, kind: str) -> bool:
-    """Whether a value is of a kind; tuples may be lists. Classes are told by name: imports cost."""
+def _fits(value: Any, kind: str) -> bool:
+    """Whether a value is of a kind, by names of classes: nothing is imported. Lists are tuples."""
     if kind.startswith("tuple"):
-        of, second = kind.removeprefix("tuple[").removesuffix("]").split(", ")
-        right = isinstance(given, tuple | list) and (second == "..." or len(given) == 2)
-        return right and all(_fits(one, of) for one in given)
+        item_kind, last = kind.removeprefix("tuple[").removesuffix("]").split(", ")
+        matches = isinstance(value, tuple | list) and (last == "..." or len(value) == 2)
+        return matches and all(_fits(item, item_kind) for item in value)
     if kind in _BUILT_IN:
-        return isinstance(given, _BUILT_IN[kind])
-    return kind in (own.__name__ for own in type(given).__mro__)
+        return isinstance(value, _BUILT_IN[kind])
+    return kind in (ancestor.__name__ for ancestor in type(value).__mro__)
 
 
 @cache
 def _list_kinds(annotation: str) -> tuple[str, ...]:
-    """Kinds that an annotation of public classes and paths alone names; of others none."""
+    """Alternatives of an annotation of public classes and paths; none for other annotations."""
     names = {*re.findall(r"\w+", annotation)} - {"tuple", "None"}
-    told = names - {"str"} and names <= {"str", "Path", *wholearm.__all__}
-    return tuple(annotation.split(" | ")) if told else ()
+    checkable = names - {"str"} and names <= {"str", "Path", *wholearm.__all__}
+    return tuple(annotation.split(" | ")) if checkable else ()
 
 
-def check_kinds(annotations: Mapping[str, str], given: Mapping[str, Any]) -> None:
-    """Raise an `InputError` for the first value that is of none of the kinds of its annotation.
+def check_kinds(annotations: Mapping[str, str], arguments: Mapping[str, Any]) -> None:
+    """Raise an `InputError` for the first argument whose class its annotation does not allow.
 
-    Annotations that name other than public classes and paths are left to other checks.
+    Only annotations of public classes and paths are checked here.
     """
-    for name, value in given.items():
+    for name, value in arguments.items():
         kinds = _list_kinds(annotations.get(name, "Any"))
         if kinds and not any(_fits(value, kind) for kind in kinds):
             raise InputError("", name, f"{value!r} given; allowed: {', '.join(kinds)}")
 
 
 def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """A public function that refuses arguments of the wrong class by name."""
-    annotations = {name: own.annotation for name, own in signature(function).parameters.items()}
+    """The function with a check of the classes of its arguments (`check_kinds`)."""
+    annotations = {name: p.annotation for name, p in signature(function).parameters.items()}
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:

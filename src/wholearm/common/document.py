@@ -16,11 +16,11 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 import numpy as np
 
 
-def plain(value: Any, finite: bool = True) -> Any:
-    """`value` in plain containers for JSON, if `finite` with None for NaN and infinity.
+def to_plain(value: Any, finite: bool = True) -> Any:
+    """`value` as dicts, lists, numbers and text for JSON; if `finite`, NaN and infinity are None.
 
-    Of named tuples and dataclasses the properties that they name as `derived`, and all fields but
-    those that a `repr` leaves out.
+    Named tuples and dataclasses become dicts of the properties listed in their `derived` and of
+    the fields that their `repr` shows.
     """
     names = [field.name for field in fields(value) if field.repr] if is_dataclass(value) else ()
     if names := [*getattr(value, "derived", ()), *(names or getattr(value, "_fields", ()))]:
@@ -30,19 +30,19 @@ def plain(value: Any, finite: bool = True) -> Any:
     elif isinstance(value, Enum):
         value = value.value
     if isinstance(value, Mapping):
-        return {key: plain(item, finite) for key, item in value.items()}
+        return {key: to_plain(item, finite) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item, finite) for item in value]
+        return [to_plain(item, finite) for item in value]
     return None if finite and isinstance(value, float) and not math.isfinite(value) else value
 
 
 def restore(kind: Any, value: Any) -> Any:
-    """The value of a type that `plain` has been given: None stands for a float that is NaN.
+    """Inverse of `to_plain`: the value of type `kind`. None for a float is NaN.
 
     Types are named tuples, dataclasses, numbers, text, and tuples, mappings and optional ones of
-    these. What is missing is as by default; what a type has `derived` is left out.
+    these. Missing fields have their defaults; `derived` properties are skipped.
 
-    TypeError, ValueError, AttributeError if it is none of this type.
+    TypeError, ValueError, AttributeError if the value is not of this type.
     """
     origin, parts = get_origin(kind), get_args(kind)
     if type(None) in parts:
@@ -53,15 +53,15 @@ def restore(kind: Any, value: Any) -> Any:
     if origin is Mapping:
         return {str(key): restore(parts[1], item) for key, item in value.items()}
     if hasattr(kind, "_fields") or is_dataclass(kind):
-        hints, left = get_type_hints(kind), getattr(kind, "derived", ())
-        return kind(**{k: restore(hints.get(k), v) for k, v in value.items() if k not in left})
+        hints, derived = get_type_hints(kind), getattr(kind, "derived", ())
+        return kind(**{k: restore(hints.get(k), v) for k, v in value.items() if k not in derived})
     if kind is float and value is None:
         return math.nan
     return kind(value)
 
 
 SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
-"""What numbers in SI units are multiplied by in a column of that unit."""
+"""Factors from SI units to the unit of a column."""
 
 
 class Table(NamedTuple):
@@ -72,13 +72,13 @@ class Table(NamedTuple):
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]  # numbers, several for one cell, or text; None and NaN: a dash
     title: str = ""
-    most: int | None = None  # most rows that are rendered as text; the others are counted
+    max_rows: int | None = None  # most rows that are rendered as text; the others are counted
 
     @staticmethod
     def of(items: Iterable[Any], columns: Mapping[str, str], title: str = "") -> Table:
-        """A row for each item, with the attributes that columns are given by, such as ``a.b``.
+        """A row for each item: the values of its attributes, such as ``a.b``, by their columns.
 
-        Where there is no a there is no value.
+        If a is None, the value is None.
         """
         rows = [[_find(item, name) for name in columns] for item in items]
         return Table(list(columns.values()), rows, title)
@@ -90,7 +90,7 @@ class Table(NamedTuple):
         return [name if colon else text for name, colon, text in parts]
 
     @property
-    def forms(self) -> list[str]:
+    def formats(self) -> list[str]:
         """Formats of the columns, empty for text."""
         return [column.rpartition(":")[2] if ":" in column else "" for column in self.columns]
 
@@ -98,44 +98,44 @@ class Table(NamedTuple):
     def cells(self) -> list[list[str]]:
         """The rows as text."""
         scales = [SCALES.get(head.rpartition("[")[2].rstrip("]"), 1.0) for head in self.heads]
-        columns = self.forms, scales
+        columns = self.formats, scales
         return [list(map(show, row, *columns)) for row in self.rows]
 
     def to_text(self) -> str:
         """Aligned columns under their names."""
-        forms, lines = self.forms, [self.heads, *self.cells[: self.most]]
+        formats, lines = self.formats, [self.heads, *self.cells[: self.max_rows]]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        aligned = [f"{'>' if f else '<'}{width}" for f, width in zip(forms, widths, strict=True)]
+        aligned = [f"{'>' if f else '<'}{width}" for f, width in zip(formats, widths, strict=True)]
         text = [self.title] if self.title else []
         text += ["  ".join(map(format, line, aligned)).rstrip() for line in lines]
-        rest = len(self.rows) - len(self.rows[: self.most])
-        return "\n".join([*text, *([f"... and {rest} more, see --json"] if rest else [])])
+        n_hidden = len(self.rows) - len(self.rows[: self.max_rows])
+        return "\n".join([*text, *([f"... and {n_hidden} more, see --json"] if n_hidden else [])])
 
     def to_html(self) -> str:
         """The table as HTML; cells of text have the class ``text``."""
-        looks = ["" if form else ' class="text"' for form in self.forms]
+        styles = ["" if form else ' class="text"' for form in self.formats]
         table = ""
         for kind, line in [("th", self.heads), *(("td", line) for line in self.cells)]:
-            pairs = zip(looks, line, strict=True)
-            cells = "".join(f"<{kind}{look}>{escape(cell)}</{kind}>" for look, cell in pairs)
+            pairs = zip(styles, line, strict=True)
+            cells = "".join(f"<{kind}{style}>{escape(cell)}</{kind}>" for style, cell in pairs)
             table += f"<tr>{cells}</tr>"
         title = f"<caption>{escape(self.title)}</caption>" if self.title else ""
         return f'<div class="scroll"><table>{title}{table}</table></div>'
 
     def to_markdown(self) -> str:
         """The table as Markdown."""
-        rule = ["---:" if form else "---" for form in self.forms]
+        rule = ["---:" if form else "---" for form in self.formats]
         lines = [[cell.replace("|", "\\|") for cell in line] for line in (self.heads, *self.cells)]
         lines.insert(1, rule)
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 class Document(NamedTuple):
-    """What a result says."""
+    """Text of a result: title, verdict, reason, lines and tables."""
 
-    title: str  # what it is about
-    verdict: str = ""  # whether that holds, in a word; empty where nothing is judged
-    reason: str = ""  # the sentence behind it
+    title: str
+    verdict: str = ""  # one word, "ok" or other; empty where nothing is judged
+    reason: str = ""  # a sentence
     parts: Sequence[str | Table] = ()  # lines and tables; empty ones are left out
 
     @property
@@ -144,13 +144,13 @@ class Document(NamedTuple):
         return ": ".join(filter(None, (self.title, self.verdict, self.reason)))
 
     @property
-    def shown(self) -> list[str | Table]:
+    def contents(self) -> list[str | Table]:
         """The parts that are not empty."""
         return [part for part in self.parts if (part.rows if isinstance(part, Table) else part)]
 
     def to_text(self) -> str:
-        """Lines of text, with an empty one above and below tables."""
-        parts = [self.head, *self.shown] if self.head else self.shown
+        """Lines of text, with an empty line above and below each table."""
+        parts = [self.head, *self.contents] if self.head else self.contents
         blocks = list[str]()
         for is_text, group in groupby(parts, lambda part: isinstance(part, str)):
             texts = [part if isinstance(part, str) else part.to_text() for part in group]
@@ -159,22 +159,22 @@ class Document(NamedTuple):
 
     def to_markdown(self) -> str:
         """A page of Markdown."""
-        blocks = (part if isinstance(part, str) else part.to_markdown() for part in self.shown)
+        blocks = (part if isinstance(part, str) else part.to_markdown() for part in self.contents)
         return "\n\n".join([f"# {self.title}", *blocks]) + "\n"
 
     def to_html(self) -> str:
-        """Paragraphs and tables of HTML; of class ``ok`` or ``bad`` as the verdict is."""
-        look = {"": "", "ok": ' class="ok"'}.get(self.verdict, ' class="bad"')
-        parts = [f"<p{look}>{escape(self.head)}</p>"] if self.head else []
+        """Paragraphs and tables of HTML; the head has class ``ok`` or ``bad`` by the verdict."""
+        style = {"": "", "ok": ' class="ok"'}.get(self.verdict, ' class="bad"')
+        parts = [f"<p{style}>{escape(self.head)}</p>"] if self.head else []
         parts += [
             f"<p>{escape(part)}</p>" if isinstance(part, str) else part.to_html()
-            for part in self.shown
+            for part in self.contents
         ]
         return "\n".join(parts)
 
 
 def format_csv(rows: Iterable[Mapping[str, Any]], heads: Iterable[str]) -> str:
-    """Entries of rows by their heads as CSV, with all digits."""
+    """Rows as CSV under the column names `heads`, with all digits."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, list(heads), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -183,7 +183,7 @@ def format_csv(rows: Iterable[Mapping[str, Any]], heads: Iterable[str]) -> str:
 
 
 def write_svg(figure: Any) -> str:
-    """The drawing of a figure as SVG, without the head of a file."""
+    """A figure as an SVG element, without the XML declaration."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", metadata={"Date": None})
     text = stream.getvalue()
@@ -191,11 +191,11 @@ def write_svg(figure: Any) -> str:
 
 
 class Brief:
-    """What is one line as a `repr`."""
+    """Mixin: the `repr` is one line."""
 
     @property
     def headline(self) -> str:
-        """What it is, in a line."""
+        """Description in one line."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -204,35 +204,35 @@ class Brief:
 
 
 class Drawn(Brief):
-    """A motion or a map, which is a picture in notebooks: SVG under its line."""
+    """Mixin of motions and maps: notebooks show a figure (SVG) under the `repr`."""
 
-    drawn_by = "plots", "force_margins"  # module and function of `figures`
+    drawing_function = "plots", "force_margins"  # module and function of `figures`
 
     def _repr_html_(self) -> str:
-        # Figures stand on everything else, so that nothing loads them before it is drawn.
-        module = import_module(f"wholearm.figures.{self.drawn_by[0]}")
-        figure = getattr(module, self.drawn_by[1])(self)
+        # Figures import the other packages, and are imported only when they are drawn.
+        module = import_module(f"wholearm.figures.{self.drawing_function[0]}")
+        figure = getattr(module, self.drawing_function[1])(self)
         return f"<p>{escape(repr(self))}</p>{write_svg(figure)}"
 
 
 class Result(Brief):
-    """A result that says what it is by its `document`; rendering is the same for all."""
+    """Base of results: rendered as text, HTML and JSON from their `document`."""
 
-    derived: tuple[str, ...] = ()  # properties that plain values have beside the fields
+    derived: tuple[str, ...] = ()  # properties that `to_plain` adds to the fields
 
     @property
     def document(self) -> Document:
-        """What it says."""
+        """The result as a document."""
         raise NotImplementedError
 
     @property
     def values(self) -> Any:
-        """What `to_dict` makes plain."""
+        """Object that `to_dict` converts."""
         return self
 
     @property
     def ok(self) -> bool:
-        """Whether everything holds that was looked at."""
+        """Whether all checks passed."""
         return True
 
     @property
@@ -242,11 +242,11 @@ class Result(Brief):
 
     @property
     def headline(self) -> str:
-        """What it is, in a line."""
+        """Description in one line."""
         return self.document.head
 
     def judge(self, name: str, reason: str, parts: Sequence[str | Table]) -> Document:
-        """The document of a result that holds or does not."""
+        """The document with the verdict "ok" or "FAILED"."""
         return Document(name, "ok" if self.ok else "FAILED", reason, parts)
 
     def to_text(self) -> str:
@@ -254,8 +254,8 @@ class Result(Brief):
         return self.document.to_text()
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, with None where there is no number."""
-        values: dict[str, Any] = plain(self.values)
+        """Values for JSON, with None for NaN and infinity (`to_plain`)."""
+        values: dict[str, Any] = to_plain(self.values)
         return values
 
     def _repr_html_(self) -> str:
@@ -269,7 +269,7 @@ def _find(item: Any, name: str) -> Any:
 
 
 def show(value: Any, form: str, scale: float = 1.0) -> str:
-    """A value as text, a number in a format and times a scale; a dash where there is none."""
+    """A value as text: numbers times a scale in a format, a dash for None and NaN."""
     if isinstance(value, str | bool):
         return str(value).lower() if isinstance(value, bool) else value
     if isinstance(value, tuple | list | np.ndarray):
@@ -280,13 +280,13 @@ def show(value: Any, form: str, scale: float = 1.0) -> str:
 
 
 def fixed(size: float, digits: int = 3) -> str:
-    """The format that gives a value of this size so many significant digits; no zero is minus."""
-    places = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
-    return f"z.{min(max(places, 0), 15)}f"
+    """Format specifier with `digits` significant digits at this size, without negative zero."""
+    decimals = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
+    return f"z.{min(max(decimals, 0), 15)}f"
 
 
 class Difference(NamedTuple):
-    """A key with two values, as text; `nothing` where one table does not have it."""
+    """A key with its two values as text; `nothing` where a table lacks the key."""
 
     key: str
     one: str
@@ -294,25 +294,25 @@ class Difference(NamedTuple):
 
 
 def find_differences(
-    one: Any, other: Any, free: tuple[str, ...] = (), key: str = ""
+    one: Any, other: Any, ignored: tuple[str, ...] = (), key: str = ""
 ) -> Iterator[Difference]:
-    """The keys in which two nested tables differ, in their order.
+    """The keys in which two nested tables of mappings and lists differ, in their order.
 
-    They hold mappings and lists. They may differ in names that are `free`, at any depth, or only at
-    the top if these begin with a dot; `key` is that of the tables themselves.
+    Names in `ignored` are skipped at any depth, or at the top level only if they begin with a dot.
+    `key` is the key of the tables themselves.
     """
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for name in dict.fromkeys([*one, *other]):
-            if name in free or (not key and f".{name}" in free):
+            if name in ignored or (not key and f".{name}" in ignored):
                 continue
             inner = f"{key}.{name}" if key else str(name)
-            yield from find_differences(one.get(name), other.get(name), free, inner)
+            yield from find_differences(one.get(name), other.get(name), ignored, inner)
     elif isinstance(one, list | tuple) and isinstance(other, list | tuple):
         if len(one) != len(other):
             yield Difference(key, f"{len(one)} entries", f"{len(other)}")
             return
         for k, pair in enumerate(zip(one, other, strict=True), start=1):
-            yield from find_differences(*pair, free, f"{key}[{k}]")
+            yield from find_differences(*pair, ignored, f"{key}[{k}]")
     elif one != other:
         yield Difference(key, _write(one), _write(other))
 
@@ -323,8 +323,8 @@ def _write(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
-    """The first differences in words; `one` and `other` say where the values stand."""
-    texts = [f"{d.key} ({d.one} {one}, {d.other} {other})" for d in found]
+def describe_differences(differences: Iterable[Difference], one: str, other: str) -> str:
+    """The first three differences in words; `one` and `other` name the two tables."""
+    texts = [f"{d.key} ({d.one} {one}, {d.other} {other})" for d in differences]
     more = [f"and {len(texts) - 3} more"] if texts[3:] else []
     return ", ".join(texts[:3] + more)

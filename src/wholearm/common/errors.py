@@ -1,4 +1,4 @@
-"""What can go wrong, by the exit status that the command line gives it."""
+"""Errors, with the exit status of the command line; checks of numbers and vectors."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ if TYPE_CHECKING:
 
 
 class Parameter(NamedTuple):
-    """A number that sets limits, and may be changed to let a motion be planned."""
+    """A number that sets limits; another value may make a motion feasible."""
 
     name: str
-    value: float  # as it is
+    value: float  # current value
     unit: str
-    sign: int  # 1 if limits give way as it grows, -1 if as it falls (not below zero)
-    key: str = ""  # key of it in a problem, for `Problem.with_`; `duration` is an option
-    mirrored: str = ""  # key of what has minus this value, such as the base of the other finger
+    sign: int  # 1 if limits relax as it grows, -1 if as it falls (not below zero)
+    key: str = ""  # its key for `Problem.with_`; `duration` is an option
+    mirrored: str = ""  # key of the number with the opposite value: the other finger's base
 
     @property
     def is_speed(self) -> bool:
-        """Whether it is a speed, of which motions know the square."""
+        """Whether it is a speed, whose square enters the limits."""
         return self.unit == "rad/s"
 
 
 class Change(NamedTuple):
-    """A parameter and another value of it that a plan was found with."""
+    """A parameter and another value, with which a plan was found."""
 
     parameter: Parameter
     value: float
 
     @property
     def values(self) -> dict[str, float]:
-        """What changes, as `Problem.with_` takes it."""
+        """Changed keys and values, arguments of `Problem.with_`."""
         parameter = self.parameter
         mirrored = {parameter.mirrored: -self.value} if parameter.mirrored else {}
         return {parameter.key: self.value} | mirrored
 
     @property
     def relative(self) -> float:
-        """How large the change is, over the value or what it becomes."""
+        """Size of the change over the larger of the two values."""
         before, after = self.parameter.value, self.value
         return abs(after - before) / max(abs(before), abs(after), 1e-300)
 
@@ -57,54 +57,54 @@ class Change(NamedTuple):
 
 
 class LimitPlace(NamedTuple):
-    """Where in a motion something is."""
+    """A place of a motion."""
 
     phase: int  # number of the phase
-    time: float  # [s]: from the start of the first of the phases that have no plan
-    text: str  # both in words, or the pose
+    time: float  # [s]: from the start of the first phase without a plan
+    text: str  # phase and time in words, or the pose
 
 
 class Shortfall(NamedTuple):
-    """A limit that cannot be kept."""
+    """A violated limit of the motion with the least violation."""
 
-    kind: str  # what it limits: `press`, `cone`, `torque`, `speed`
-    part: str  # the contact or finger concerned
+    kind: str  # limited quantity: `press` (normal force), `cone`, `torque`, `speed`
+    part: str  # its contact or finger
     limit: str  # the limit in words, with its value
-    amount: float  # by how much it is missed at worst
+    amount: float  # largest violation
     unit: str
-    place: LimitPlace  # where that is
-    share: float  # the amount over what is much for such a limit, which shortfalls are ranked by
+    place: LimitPlace  # where the violation is largest
+    share: float  # the amount over the scale of such limits; shortfalls are sorted by it
 
     def __str__(self) -> str:
         return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.place.text}"
 
 
 class WholearmError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of all errors of this package."""
 
     exit_status = 1  # of the command line: 1 if the task cannot be done, 2 if the input is bad
-    phases: Sequence[int] = ()  # numbers of those that have no plan together, where that is known
+    phases: Sequence[int] = ()  # numbers of the phases that have no plan together, if known
     phase: int | None = None  # number of the phase that was simulated
 
     def to_dict(self) -> dict[str, Any]:
-        """Text and exit status, with whatever else the error knows, as plain values for JSON."""
-        from .document import plain  # of errors alone it is too much to import
+        """Text, exit status and further attributes, as values for JSON."""
+        from .document import to_plain  # imports NumPy, which raising an error does not need
 
         names = "source", "key", "phases", "phase", "shortfalls", "changes"
-        known = {name: getattr(self, name, None) for name in names}
-        known = {name: value for name, value in known.items() if value}
-        values: dict[str, Any] = plain({"error": str(self), "status": self.exit_status} | known)
+        extra = {name: getattr(self, name, None) for name in names}
+        extra = {name: value for name, value in extra.items() if value}
+        values: dict[str, Any] = to_plain({"error": str(self), "status": self.exit_status} | extra)
         return values
 
 
 class InputError(WholearmError):
-    """Malformed input: names the file, the key, what was given and what is allowed.
+    """Malformed input: names the file, the key, the value and the allowed values.
 
     Parameters
     ----------
     source   file (or other origin) of the input
     key      dotted key, array or column at fault; empty for the input as a whole
-    problem  what was given and what is allowed
+    problem  the value and the allowed values
     """
 
     exit_status = 2
@@ -124,20 +124,20 @@ class InputError(WholearmError):
 
 @contextmanager
 def name_source(source: str = "", prefix: str = "") -> Iterator[None]:
-    """Give source and prefix of the key to an `InputError` from inside that has no source."""
+    """Add source and key prefix to an `InputError` without source from inside the block."""
     try:
         yield
     except InputError as error:
         if error.source or not (source or prefix):
             raise
-        # Booleans of files are no Python.
+        # Files write booleans in lower case.
         text = re.sub("^(True|False)(?= )", lambda word: word[0].lower(), error.problem)
         raise InputError(source, prefix + error.key, text if source else error.problem) from None
 
 
 @contextmanager
 def name_file(path: object, key: str = "", failure: str = "cannot be read") -> Iterator[None]:
-    """Make an `InputError` of an `OSError` from inside the block: the file, what fails and why."""
+    """Turn an `OSError` from inside the block into an `InputError` with file and reason."""
     try:
         yield
     except OSError as error:
@@ -149,9 +149,9 @@ class InfeasibleError(WholearmError):
 
     Attributes
     ----------
-    shortfalls  what the motion that misses limits least is short of, the worst first
+    shortfalls  violated limits of the motion with the least violation, the worst first
     changes     changes of a single parameter with which a plan was found
-    motion      that motion, of the phases without a plan, where there is one
+    motion      that motion (elastic solution) of the phases without a plan, if there is one
     """
 
     def __init__(
@@ -167,35 +167,35 @@ class InfeasibleError(WholearmError):
 
 
 class ReplayError(WholearmError):
-    """A plan was found, but does not hold when it is replayed in the simulator."""
+    """A plan was found, but its replay in the simulator violates limits."""
 
 
 class SolverError(WholearmError):
-    """The solver stopped without an answer although the problem was not shown infeasible."""
+    """The solver did not converge, and did not detect infeasibility."""
 
 
 class JammingError(WholearmError):
-    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
+    """Jamming: with friction the reduced inertia is not positive; no forward dynamics."""
 
     changes: tuple[Change, ...] = ()  # of one coefficient of friction, with which a plan was found
 
 
 class AmbiguityError(JammingError):
-    """Friction lets other contact forces than the planned ones be possible, or nearly so."""
+    """Contact forces are not unique, or the uniqueness margin is too small."""
 
 
 class SimulationError(WholearmError):
-    """The forward simulation cannot go on (step size underflow, inconsistent start)."""
+    """The forward simulation failed (step size underflow, inconsistent start)."""
 
 
 def round_outwards(value: float, sign: int) -> float:
     """Round to three significant digits, up for the sign 1 and down for -1."""
     if value == 0 or not math.isfinite(value):
         return value
-    place = 2 - math.floor(math.log10(abs(value)))
-    # Values of so few digits stay, whatever their last bits are.
-    scaled = round(value * 10.0**place, 6)
-    return float(f"{math.ceil(scaled) if sign > 0 else math.floor(scaled)}e{-place}")
+    exponent = 2 - math.floor(math.log10(abs(value)))
+    # Values with three digits stay as they are, despite rounding errors.
+    scaled = round(value * 10.0**exponent, 6)
+    return float(f"{math.ceil(scaled) if sign > 0 else math.floor(scaled)}e{-exponent}")
 
 
 def describe_changes(changes: Sequence[Change]) -> str:
@@ -206,7 +206,7 @@ def describe_changes(changes: Sequence[Change]) -> str:
 
 
 def name_phases(phases: Sequence[int], what: str = "") -> str:
-    """One phase or several, for messages, and that they are `what`."""
+    """Numbers of phases for messages, with the predicate `what`: "phases 2 to 4 are ..."."""
     first, *others = phases
     if not others:
         return f"phase {first} is {what}" if what else f"phase {first}"
@@ -231,23 +231,23 @@ def require_number(
     return result
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
-    """The name that is meant, as the first words of a hint; empty where none is near."""
+def suggest(name: str, candidates: Iterable[str]) -> str:
+    """Hint with the closest of the allowed names; empty if none is close."""
     from difflib import get_close_matches
 
-    near = get_close_matches(name, list(known), 1, 0.5)
-    return f"did you mean {near[0]!r}? " if near else ""
+    matches = get_close_matches(name, list(candidates), 1, 0.5)
+    return f"did you mean {matches[0]!r}? " if matches else ""
 
 
-def read_share(value: str, key: str) -> float:
-    """What a text such as "10 %" says, as a fraction, or raise `InputError` naming `key`."""
-    number, sign, rest = value.partition("%")
-    share = math.nan
+def read_fraction(value: str, key: str) -> float:
+    """Fraction of a text such as "10 %", or raise `InputError` naming `key`."""
+    number, sign, suffix = value.partition("%")
+    fraction = math.nan
     with suppress(ValueError):
-        share = float(number) / 100 if sign and not rest.strip() else math.nan
-    if not 1e-4 <= share <= 1:
+        fraction = float(number) / 100 if sign and not suffix.strip() else math.nan
+    if not 1e-4 <= fraction <= 1:
         raise InputError("", key, f'{value!r} given; allowed as a share is "0.01 %" to "100 %"')
-    return share
+    return fraction
 
 
 def require_vector(value: object, key: str, size: int) -> Array:

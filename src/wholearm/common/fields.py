@@ -1,7 +1,7 @@
-"""Values that a user may give: name, unit, scale, range, default and text, declared once for each.
+"""Input values: name, unit, scale, range, default and text of each, declared once.
 
-A dataclass declares its keys by the decorator `declare`. From what `keys_of` lists follow the
-reader of problem files with its messages, ranges relative to the scene, the JSON Schema, the names
+A dataclass declares its keys by the decorator `declare`. The declared fields (`keys_of`) determine
+the reader of problem files with its messages, ranges relative to the scene, the JSON Schema, names
 of `Problem.with_`, the writer, options of the command line with their help, and tables of keys.
 """
 
@@ -21,13 +21,13 @@ from typing import Any, NamedTuple, TypeVar
 from .errors import InputError, require_number, require_vector
 
 T = TypeVar("T")
-REQUIRED: Any = object()  # default of what has to be given
+REQUIRED: Any = object()  # default of a value that is required
 Schema = Mapping[str, Any]  # JSON Schema of a value
 
 
 @dataclass(frozen=True)
 class FieldKind:
-    """What a value may be: its reader, which takes value and key and raises, and its schema."""
+    """Kind of a value: its reader, which takes value and key and raises, and its schema."""
 
     read: Callable[[Any, str], Any]
     schema: Schema
@@ -35,103 +35,103 @@ class FieldKind:
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from `low` to `high`, both included; whole ones only if `low` is an integer."""
+    """Interval of numbers [low, high]; of integers if `low` is an integer."""
 
-    low: float  # low, high: as multiples of the scale, where there is one
+    low: float  # low, high: as multiples of the scale, if there is one
     high: float
     scale: Callable[[Any, Any], float | None] | None = None  # of scene and owner; None: no range
-    of: str = ""  # what messages call the scale; ``{time}`` stands for the scene's time
+    scale_name: str = ""  # the scale in messages; ``{time}`` is replaced by the scene's time
 
     @property
-    def whole(self) -> bool:
+    def is_integer(self) -> bool:
         """Whether only whole numbers are allowed."""
         return isinstance(self.low, int)
 
     def describe(self, time: str = "the scene's time") -> str:
         """The range in words."""
-        low, high = (f"{end}" if self.whole else f"{end:g}" for end in (self.low, self.high))
-        text = f"{'whole numbers from ' if self.whole else ''}{low} to {high}"
-        return f"{text} {self.of.format(time=time)}".rstrip()
+        low, high = (f"{end}" if self.is_integer else f"{end:g}" for end in (self.low, self.high))
+        text = f"{'whole numbers from ' if self.is_integer else ''}{low} to {high}"
+        return f"{text} {self.scale_name.format(time=time)}".rstrip()
 
-    def find_fault(self, given: object) -> str:
-        """What is wrong with a value; empty if nothing is."""
-        kinds = (int,) if self.whole else (int, float)
-        is_number = isinstance(given, kinds) and not isinstance(given, bool)
-        if is_number and self.low <= given <= self.high:  # type: ignore[operator]
+    def find_fault(self, value: object) -> str:
+        """Message about a value that is not allowed; empty if it is allowed."""
+        kinds = (int,) if self.is_integer else (int, float)
+        is_number = isinstance(value, kinds) and not isinstance(value, bool)
+        if is_number and self.low <= value <= self.high:  # type: ignore[operator]
             return ""
-        return f"{given!r} given; allowed are {self.describe()}"
+        return f"{value!r} given; allowed are {self.describe()}"
 
-    def read(self, given: Any, key: str) -> Any:
+    def read(self, raw: Any, key: str) -> Any:
         """The value as int or float, or an `InputError` that names `key`."""
-        # Numbers of NumPy are no int.
-        value = given.item() if isinstance(given, Real) and hasattr(given, "item") else given
+        # NumPy integers are not instances of int.
+        value = raw.item() if isinstance(raw, Real) and hasattr(raw, "item") else raw
         if text := self.find_fault(value):
             raise InputError("", key, text)
-        return value if self.whole else float(value)
+        return value if self.is_integer else float(value)
 
     def parse(self, text: str) -> Any:
         """The value of a command-line option."""
         value: Any = text
         with suppress(ValueError):
-            value = int(text) if self.whole else float(text)
-        if wrong := self.find_fault(value):
-            raise argparse.ArgumentTypeError(wrong)
+            value = int(text) if self.is_integer else float(text)
+        if fault := self.find_fault(value):
+            raise argparse.ArgumentTypeError(fault)
         return value
 
     def check(
-        self, key: str, given: Any, unit: str = "", scene: Any = None, owner: Any = None
+        self, key: str, values: Any, unit: str = "", scene: Any = None, owner: Any = None
     ) -> None:
-        """Raise an `InputError` that names `key` if a number, or one of several, is out of range.
+        """Raise an `InputError` that names `key` if a number (or one of several) is out of range.
 
-        What stands for none, 0 or infinity, is in every range: the kind says whether it is allowed.
+        0 and infinity stand for "none" and are in every range; the kind decides on them.
         """
         scale = 1.0 if self.scale is None else self.scale(scene, owner)
         if scale is None:
             return
         low, high = self.low * scale, self.high * scale
-        several = hasattr(given, "__len__") and not isinstance(given, str)
-        for value in given if several else (given,):
-            counts = isinstance(value, Real) and value and math.isfinite(value)
-            # A scale is rounded: in other units a number at its bound may be past it by that.
-            slack = 1e-12 * abs(value) if counts and self.scale is not None else 0.0
-            if counts and not low - slack <= value <= high + slack:
-                # Units of a scene with such a number may not exist.
-                time = f"{scene.scales.time:.3g} s" if "{time}" in self.of else ""
-                what = f" ({self.describe(time)})" if self.of else ""
+        is_sequence = hasattr(values, "__len__") and not isinstance(values, str)
+        for value in values if is_sequence else (values,):
+            in_use = isinstance(value, Real) and value and math.isfinite(value)
+            # In other units, rounding of the scale may move a number at its bound past it.
+            slack = 1e-12 * abs(value) if in_use and self.scale is not None else 0.0
+            if in_use and not low - slack <= value <= high + slack:
+                # The scene's units may not be computable with such a number.
+                time = f"{scene.scales.time:.3g} s" if "{time}" in self.scale_name else ""
+                meaning = f" ({self.describe(time)})" if self.scale_name else ""
                 text = f"{low:.3g} to {high:.3g} {unit}".rstrip()
-                raise InputError("", key, f"{value:g} given; allowed are {text}{what}")
+                raise InputError("", key, f"{value:g} given; allowed are {text}{meaning}")
 
 
 def choice(*words: str) -> FieldKind:
-    """One of several words, or the member of an enumeration that has it."""
+    """One of several words, or the enumeration member with this value."""
 
-    def read(given: Any, key: str) -> Any:
-        if getattr(given, "value", given) not in words:
+    def read(value: Any, key: str) -> Any:
+        if getattr(value, "value", value) not in words:
             allowed = " and ".join(map(repr, words)) if len(words) == 2 else str(words)[1:-1]
-            raise InputError("", key, f"{given!r} given; allowed are {allowed}")
-        return given
+            raise InputError("", key, f"{value!r} given; allowed are {allowed}")
+        return value
 
     return FieldKind(read, {"enum": list(words)})
 
 
 def _read_type(kind: type, text: str) -> Callable[[Any, str], Any]:
-    """Reader of values of one type; `text` follows a value that is of another one."""
+    """Reader of values of one type; messages are the value followed by `text`."""
 
-    def read(given: Any, key: str) -> Any:
-        if not isinstance(given, kind):
-            raise InputError("", key, f"{given!r} {text}")
-        return given
+    def read(value: Any, key: str) -> Any:
+        if not isinstance(value, kind):
+            raise InputError("", key, f"{value!r} {text}")
+        return value
 
     return read
 
 
 def refer(name: str) -> Schema:
-    """The schema that has a name."""
+    """Reference to a named schema."""
     return {"$ref": f"#/definitions/{name}"}
 
 
-def leave(schema: Schema) -> FieldKind:
-    """What has a reader of its own."""
+def unread(schema: Schema) -> FieldKind:
+    """Values that another function reads: the schema alone."""
     return FieldKind(lambda value, _: value, schema)
 
 
@@ -149,19 +149,19 @@ TEXT = FieldKind(_read_type(str, "is not a string"), {"type": "string"})
 
 @dataclass(frozen=True)
 class Field:
-    """A value that a user may give."""
+    """An input value."""
 
     name: str
-    text: str = ""  # what it is, with its unit in brackets
+    text: str = ""  # description, with the unit in brackets
     kind: FieldKind | Range = NUMBER
-    scale: str = ""  # unit of the scene, of `Scales`, that it counts in
-    ranges: tuple[Range, ...] = ()  # which it has to be in, relative to the scene
-    default: Any = REQUIRED  # REQUIRED where a value has to be given
-    attribute: str = ""  # of the dataclass that keeps it, if it is not the name
+    scale: str = ""  # attribute of `Scales`: its unit of the scene
+    ranges: tuple[Range, ...] = ()  # allowed ranges, relative to the scene
+    default: Any = REQUIRED  # REQUIRED if there is none
+    attribute: str = ""  # attribute of the dataclass, if it differs from the name
 
     @property
     def required(self) -> bool:
-        """Whether a value has to be given."""
+        """Whether the value is required."""
         return self.default is REQUIRED
 
     @property
@@ -171,21 +171,21 @@ class Field:
         return match[1] if match else ""
 
     @property
-    def shown_default(self) -> Any:
-        """The default, if it is a value that could be given, or None."""
-        left_out = self.required or self.default == math.inf
-        return None if left_out else getattr(self.default, "value", self.default)
+    def default_value(self) -> Any:
+        """The default; None if there is none, or if it cannot be written (infinity)."""
+        absent = self.required or self.default == math.inf
+        return None if absent else getattr(self.default, "value", self.default)
 
     @property
     def schema(self) -> dict[str, Any]:
-        """The value's JSON Schema; only keys of files have one, and no options."""
+        """JSON Schema of the value; keys of files have one, options do not."""
         assert isinstance(self.kind, FieldKind)
-        annotations = {"default": self.shown_default, "description": self.text}
+        annotations = {"default": self.default_value, "description": self.text}
         return {**self.kind.schema} | {k: v for k, v in annotations.items() if v not in (None, "")}
 
     def describe_default(self) -> str:
-        """The default as it is shown to a user; empty where there is none."""
-        value = self.shown_default
+        """The default as text; empty if there is none."""
+        value = self.default_value
         if isinstance(value, bool):
             return str(value).lower()
         if isinstance(value, float):
@@ -196,21 +196,21 @@ class Field:
         """The text, with range and default."""
         allowed = [each.describe() for each in (self.kind, *self.ranges) if isinstance(each, Range)]
         default = f"default {self.describe_default()}" if self.describe_default() else ""
-        more = "; ".join(filter(None, (*allowed, default)))
-        return self.text + (more and f" ({more})")
+        notes = "; ".join(filter(None, (*allowed, default)))
+        return self.text + (notes and f" ({notes})")
 
-    def read(self, given: Any, key: str) -> Any:
-        """The value, if it is of its kind; raises an `InputError` that names `key`."""
-        if self.default is None and given is None:
+    def read(self, value: Any, key: str) -> Any:
+        """The value, checked by its kind; raises an `InputError` that names `key`."""
+        if self.default is None and value is None:
             return None
-        if self.default == math.inf and given == math.inf:
+        if self.default == math.inf and value == math.inf:
             return math.inf
-        return self.kind.read(given, key)
+        return self.kind.read(value, key)
 
-    def check(self, given: Any, key: str, scene: Any, owner: Any = None) -> None:
+    def check(self, value: Any, key: str, scene: Any, owner: Any = None) -> None:
         """Raise an `InputError` if a value is out of a range relative to the scene."""
-        for field in self.ranges:
-            field.check(key, given, self.unit, scene, owner)
+        for bounds in self.ranges:
+            bounds.check(key, value, self.unit, scene, owner)
 
 
 def key(
@@ -219,10 +219,10 @@ def key(
     kind: FieldKind | Range = NUMBER,
     scale: str = "",
     *ranges: Range,
-    **more: Any,
+    **settings: Any,
 ) -> Field:
-    """A `Field` with its ranges one after the other."""
-    return Field(name, text, kind, scale, ranges, **more)
+    """A `Field`, with its ranges as positional arguments."""
+    return Field(name, text, kind, scale, ranges, **settings)
 
 
 def name_fields(*fields: Field) -> dict[str, Field]:
@@ -231,9 +231,9 @@ def name_fields(*fields: Field) -> dict[str, Field]:
 
 
 def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
-    """Say which fields of a dataclass are keys of a file or options, and what they are.
+    """Declare fields of a dataclass as keys of a file or as options.
 
-    Their defaults are those of the dataclass, where it has any, and its docstring lists them.
+    Defaults of the dataclass take precedence. The keys are appended to its docstring.
     """
 
     def describe(owner: type[T]) -> type[T]:
@@ -243,7 +243,7 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
             attribute = field.attribute or field.name
             default = defaults[attribute]
             keys[attribute] = field if default is MISSING else replace(field, default=default)
-        lines = [f"    {k}\n        {one.explain()}" for k, one in keys.items() if one.text]
+        lines = [f"    {k}\n        {field.explain()}" for k, field in keys.items() if field.text]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
         owner.__keys__ = keys  # type: ignore[attr-defined]
         return owner
@@ -258,7 +258,7 @@ def keys_of(owner: Any) -> dict[str, Field]:
 
 
 def read_keys(owner: Any, prefix: str = "") -> None:
-    """Check the declared fields of a frozen dataclass, and keep them as they are read."""
+    """Check the declared fields of a frozen dataclass, and store the values that were read."""
     for attribute, field in keys_of(owner).items():
         value = field.read(getattr(owner, attribute), f"{prefix}{field.name}")
         object.__setattr__(owner, attribute, value)
@@ -281,18 +281,18 @@ _TEXT = re.compile(
 
 
 class Option(NamedTuple):
-    """An option of a command, or a file that it takes."""
+    """An option or a file argument of a command."""
 
     field: Field
-    flags: Sequence[str]  # the name alone where it is a file
+    flags: Sequence[str]  # the name alone if it is a file
     arguments: Mapping[str, Any]  # of `ArgumentParser.add_argument`
 
 
 def read_options(table: str) -> list[Option]:
-    """Options of a table: flags, what they are, default and range, one to a line.
+    """Options of a table with one line each: flags, description, default and range.
 
-    A table reads like the help that it becomes, as with docopt. Two spaces or more end the flags,
-    and lines that begin with spaces go on with the text::
+    The table is written like the help text, as with docopt. Two spaces or more end the flags;
+    lines that begin with spaces continue the description::
 
         [files PLAN ...]    none, one or more files
         [topic]             one of these words, or none among model|map
@@ -308,40 +308,40 @@ def read_options(table: str) -> list[Option]:
     return [_read_option(*re.split(r" {2,}", line, maxsplit=1)) for line in lines]
 
 
-def _read_option(usage: str, rest: str = "") -> Option:
-    match = _TEXT.fullmatch(rest)
+def _read_option(usage: str, description: str = "") -> Option:
+    match = _TEXT.fullmatch(description)
     assert match is not None
     text, default, low, high, words = match.groups()
-    optional, several = usage.endswith("]"), usage.rstrip("]").endswith("...")
+    optional, repeated = usage.endswith("]"), usage.rstrip("]").endswith("...")
     parts = usage.removeprefix("[").rstrip("]").removesuffix("...").split()
     flags = [part for part in parts if part.startswith("-")]
     is_file, flags = not flags, flags or parts[:1]
     metavar = " ".join(parts[len(flags) :]).removeprefix("[") or None
     name = flags[-1].lstrip("-").replace("-", "_")
     kind: FieldKind | Range = TEXT
-    field_default: Any = [] if several else default
-    nargs = ("*" if optional else "+") if several else "?" if optional else None
-    more: dict[str, Any] = {"metavar": metavar, "nargs": nargs}
+    field_default: Any = [] if repeated else default
+    nargs = ("*" if optional else "+") if repeated else "?" if optional else None
+    settings: dict[str, Any] = {"metavar": metavar, "nargs": nargs}
     if low:
-        read = float if re.search(r"[.e]", low) else int
-        kind = Range(read(low), read(high))
+        number = float if re.search(r"[.e]", low) else int
+        kind = Range(number(low), number(high))
         field_default = None if default is None else kind.parse(default)
-        more |= {"type": kind.parse} | ({"const": 1.0} if nargs == "?" else {})
+        settings |= {"type": kind.parse} | ({"const": 1.0} if nargs == "?" else {})
     elif words:
         kind = choice(*words.split("|"))
         if optional:
-            more["choices"] = words.split("|")
+            settings["choices"] = words.split("|")
             if not is_file:
-                # It may be left out before a file, too: the caller puts the first word in.
-                more |= {"nargs": None, "metavar": f"[{metavar}]"}
+                # The word is optional before a file, too: the caller inserts the first one.
+                settings |= {"nargs": None, "metavar": f"[{metavar}]"}
     elif metavar is None and not is_file:
         kind, field_default = BOOLEAN, name.startswith("no_")
         name = name.removeprefix("no_")
-        more = {"action": f"store_{str(not field_default).lower()}", "dest": name}
+        settings = {"action": f"store_{str(not field_default).lower()}", "dest": name}
     if not is_file:
-        more |= {"default": field_default, "required": text.endswith("(required)")}
-    off = kind is BOOLEAN and field_default
-    field = Field(name, f"False: {text}" if off else text, kind, default=field_default)
-    shown = "" if kind is BOOLEAN or several else field.describe_default()
-    more["help"] = text + (shown and f" ({shown})")
-    return Option(field, flags, more)
+        settings |= {"default": field_default, "required": text.endswith("(required)")}
+    inverted = kind is BOOLEAN and field_default
+    field = Field(name, f"False: {text}" if inverted else text, kind, default=field_default)
+    default_text = "" if kind is BOOLEAN or repeated else field.describe_default()
+    settings["help"] = text + (default_text and f" ({default_text})")
+    return Option(field, flags, settings)

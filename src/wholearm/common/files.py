@@ -1,4 +1,4 @@
-"""Output files that appear whole or not at all."""
+"""Atomic writing of output files; reading of JSON and of array archives."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from .errors import InputError, name_file
-from .signals import held, on_end
+from .signals import defer_signals, register_cleanup
 
 READ: set[str] = set()  # resolved paths of the files that the command being run reads
-LARGEST = 2**28  # largest array that is read [byte]: a million rows of everything take less
+MAX_BYTES = 2**28  # largest array that is read [byte]: a million rows of everything take less
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Raise an `InputError`, before long work, if no file can be written at `path`."""
+    """Raise an `InputError` if no file can be written at `path`; called before long tasks."""
     target, resolved = os.fspath(path), os.path.realpath(path)
     folder = os.path.dirname(resolved)
     if resolved in READ:
@@ -29,16 +29,16 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     if os.path.isdir(target):
         raise InputError(target, "", "cannot be written: is a folder")
     if not os.path.isdir(folder):
-        what = f"{folder} is not a folder" if os.path.exists(folder) else f"no folder {folder}"
-        raise InputError(target, "", f"cannot be written: {what}")
+        reason = f"{folder} is not a folder" if os.path.exists(folder) else f"no folder {folder}"
+        raise InputError(target, "", f"cannot be written: {reason}")
     if not os.access(folder, os.W_OK) and not _is_special(target):
         raise InputError(target, "", f"cannot be written: no permission in {folder}")
 
 
 def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
-    """The ending of a file's name, in small letters, or an `InputError` if it is not allowed.
+    """The extension of a file name in lower case, or an `InputError` if it is not allowed.
 
-    A device or a pipe needs none.
+    Devices and pipes need none.
     """
     ending = os.path.splitext(path)[1].lower()
     if ending not in allowed and not _is_special(os.fspath(path)):
@@ -48,13 +48,13 @@ def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
-    """Write a file through a temporary one beside it, renamed when complete, or an `InputError`.
+    """Write a file atomically: a temporary file beside it is renamed when complete.
 
-    An existing file is replaced, and what is not a file (a device, a pipe) is written to.
+    An existing file is replaced; devices and pipes are written to. `InputError` if it fails.
     """
     target, staged = os.fspath(path), _staged.get()
     if staged is None:
-        # A single file is a group of one.
+        # Outside of a group the file is a group of its own.
         with together():
             return write_whole(path, write)
     with name_file(target, failure="cannot be written"):
@@ -76,12 +76,12 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Have all files that are written in this context appear at its end, or none."""
+    """Context in which files are written as a group: all appear at its end, or none."""
     staged: list[tuple[str, str]] = []
     token = _staged.set(staged)
     try:
         yield
-        with held():
+        with defer_signals():
             for part, target in staged:
                 with name_file(target, failure="cannot be written"):
                     os.replace(part, os.path.realpath(target))
@@ -92,7 +92,7 @@ def together() -> Iterator[None]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file as a whole; see `write_whole`."""
+    """Write a text file atomically; see `write_whole`."""
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
@@ -107,13 +107,13 @@ def read_json(path: str) -> Any:
 
 
 def number_same(names: Sequence[str], form: str = "{}_{}") -> list[str]:
-    """The names, if any two are the same all with their number, in a form."""
+    """The names; if two are equal, all are numbered by the format `form`."""
     same = len({*names}) < len(names)
     return [form.format(name, k) if same else name for k, name in enumerate(names, start=1)]
 
 
 def make_folder(path: str, key: str = "") -> None:
-    """Make a folder if it is not there; an `InputError` that names the key if it cannot be made."""
+    """Create a folder if it does not exist; an `InputError` names the key if that fails."""
     with name_file(path, key, "cannot be made"):
         os.makedirs(path, exist_ok=True)
 
@@ -139,23 +139,23 @@ def _remove(part: str) -> None:
     _parts.discard(part)
 
 
-_parts: set[str] = set()  # temporary files that exist now
+_parts: set[str] = set()  # existing temporary files
 
 
 _staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default=None)
-"""Temporary files and where they are to appear, inside `together`."""
+"""Temporary files and their targets, inside `together`."""
 
 
-on_end(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
+register_cleanup(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
 
 
 def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
-    """Read the named arrays of an archive, as far as it has them.
+    """Read the named arrays of an archive (NPZ), without those that it lacks.
 
-    Nothing is unpickled. An `InputError` if it cannot be read, is no archive of arrays, or claims
-    what it does not hold.
+    Nothing is unpickled. An `InputError` if the file cannot be read, is no archive of arrays, or
+    is damaged.
     """
-    # A command that reads none has no use for these.
+    # Imported only by commands that read archives.
     import zipfile
     import zlib
 
@@ -172,8 +172,8 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
                     info = members.get(f"{name}.npy")
                     if info is None:
                         continue
-                    if info.file_size > LARGEST:
-                        problem = f"holds {info.file_size} bytes; allowed are up to {LARGEST}"
+                    if info.file_size > MAX_BYTES:
+                        problem = f"holds {info.file_size} bytes; allowed are up to {MAX_BYTES}"
                         raise InputError(source, name, problem)
                     try:
                         with archive.open(info) as member:

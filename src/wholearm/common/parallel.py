@@ -1,12 +1,12 @@
 """Independent tasks in parallel: by forked processes, or through an executor.
 
-`share` forks children where tasks are shared out, so that they have all that is known by then. Each
-process takes the next task for as long as there is one, and children send what has come of theirs.
-What a task leaves behind besides its result is lost in a child: it has to be a pure function. What
-a child does not send, as it was ended or met an error, its parent does itself.
+`run_tasks` forks child processes, which inherit all data computed before. Parent and children
+take the next task from one queue (a pipe) until it is empty; children then send their results.
+Side effects of a task are lost in a child: it has to be a pure function. The parent runs tasks
+whose results are missing, because a child was killed or an exception was raised.
 
-`run_all` goes through an executor: spawned processes (`Processes`), a Dask scheduler (`connect`),
-or any other. A `Journal` keeps what comes of tasks, to resume from.
+`run_all` uses an executor: spawned processes (`Processes`), a Dask scheduler (`connect`), or any
+other. A `Journal` stores results of tasks, so that a study can be resumed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from typing import Any, BinaryIO, TypeVar
 from .document import describe_differences, find_differences
 from .errors import InputError, name_file
 from .fields import Range
-from .signals import beat, held
+from .signals import beat, defer_signals
 
 try:
     import fcntl
@@ -48,60 +48,59 @@ _T = TypeVar("_T")
 Task = Callable[[], _T]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_sharing = False
+_parallel = False
 
 
 def count_cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def share(tasks: Sequence[Task[_T]], jobs: int | None) -> list[_T]:
+def run_tasks(tasks: Sequence[Task[_T]], jobs: int | None) -> list[_T]:
     """Results of tasks, in their order.
 
-    Processes are forked on Linux alone, where libraries bear it, if this one may have children and
-    no other thread could be in the middle of something. Otherwise, and for tasks inside of tasks,
-    one is done after the other.
+    Processes are forked only on Linux, from a process that may have children and has a single
+    thread (`can_fork`). Otherwise, and for tasks inside of tasks, tasks are run sequentially.
 
     Parameters
     ----------
-    tasks  without arguments. What they return has to be picklable.
-    jobs   most processes, this one included; as many as cores if None
+    tasks  functions without arguments; their results have to be picklable
+    jobs   largest number of processes, this one included; the number of cores if None
     """
-    global _sharing
-    most = count_cores() if jobs is None else Range(1, 256).read(jobs, "jobs")
-    count = min(most, len(tasks)) - 1
-    if count < 1 or _sharing or not can_fork():
+    global _parallel
+    limit = count_cores() if jobs is None else Range(1, 256).read(jobs, "jobs")
+    count = min(limit, len(tasks)) - 1
+    if count < 1 or _parallel or not can_fork():
         return [task() for task in tasks]
-    _sharing, children = True, list[tuple[BaseProcess, Connection]]()
+    _parallel, children = True, list[tuple[BaseProcess, Connection]]()
     source, sink = os.pipe()
     try:
         os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
         os.close(sink)
         for _ in range(count):
-            children.append(_start(tasks, source))
-        results = _take(tasks, source)
-        for _, answers in children:
-            # A child that was ended, or met an error, sends nothing.
+            children.append(_fork_child(tasks, source))
+        results = _take_tasks(tasks, source)
+        for _, receiver in children:
+            # A child that was killed, or raised an exception, sends nothing.
             with suppress(EOFError, OSError):
-                while not answers.poll(0.1):
+                while not receiver.poll(0.1):
                     beat()
-                results |= answers.recv()
+                results |= receiver.recv()
         return [results[k] if k in results else task() for k, task in enumerate(tasks)]
     finally:
-        _sharing = False
+        _parallel = False
         os.close(source)
-        for process, answers in children:
+        for process, receiver in children:
             process.kill()
             process.join()
             process.close()
-            answers.close()
+            receiver.close()
 
 
 def can_fork() -> bool:
-    """Whether this process may have children that go on from where it is."""
+    """Whether this process may be forked."""
     return (
         sys.platform == "linux"
         and not mp.current_process().daemon
@@ -109,38 +108,38 @@ def can_fork() -> bool:
     )
 
 
-def _start(tasks: Sequence[Task[Any]], source: int) -> tuple[BaseProcess, Connection]:
-    """Fork a child that takes tasks, and sends its answers."""
+def _fork_child(tasks: Sequence[Task[Any]], source: int) -> tuple[BaseProcess, Connection]:
+    """Fork a child that runs tasks; returns it and the pipe on which it sends results."""
     context = mp.get_context("fork")
-    answers, far = context.Pipe(duplex=False)
-    arguments = tasks, source, far, os.getpid()
-    process = context.Process(target=_serve, args=arguments, daemon=True)
+    receiver, sender = context.Pipe(duplex=False)
+    arguments = tasks, source, sender, os.getpid()
+    process = context.Process(target=_run_child, args=arguments, daemon=True)
     try:
-        # No signal may meet the child before it has said what it does about it.
-        with _blocked(*_SIGNALS):
+        # Signals wait until the child has installed its handlers.
+        with _block_signals(*_SIGNALS):
             process.start()
     finally:
-        far.close()
-    return process, answers
+        sender.close()
+    return process, receiver
 
 
 @contextmanager
-def _blocked(*numbers: signal.Signals) -> Iterator[None]:
-    """Have signals wait, and for good in processes that are started meanwhile."""
+def _block_signals(*numbers: signal.Signals) -> Iterator[None]:
+    """Block signals in this context; processes started in it inherit the mask."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 def end_with_parent(parent: int) -> None:
-    """Have this process killed when its parent ends, however that comes about (on Linux).
+    """Have the kernel kill this process when its parent ends (on Linux).
 
-    A signal may end the parent before it knows of a child that it has just started.
+    A signal may end the parent before it has registered a child that it has just started.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
@@ -148,28 +147,28 @@ def end_with_parent(parent: int) -> None:
             os._exit(1)
 
 
-def _serve(tasks: Sequence[Task[Any]], source: int, far: Connection, parent: int) -> None:
-    """Take tasks for as long as there are any, and send what has come of them."""
-    # The parent alone answers an interrupt, and ends its children.
+def _run_child(tasks: Sequence[Task[Any]], source: int, sender: Connection, parent: int) -> None:
+    """Run tasks until none is left, and send their results."""
+    # Only the parent handles an interrupt; it kills its children.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     end_with_parent(parent)
-    # What there is by now is not looked at for garbage, which would copy its pages.
+    # Garbage collection of inherited objects would copy their pages.
     gc.freeze()
     try:
-        results = _take(tasks, source)
+        results = _take_tasks(tasks, source)
     except KeyboardInterrupt:
-        return  # The time is over, as its parent finds out and says.
+        return  # The time limit is over; the parent reports it.
     with suppress(Exception):
-        far.send(results)
+        sender.send(results)
 
 
-def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
-    """Results of tasks by their numbers, which whoever reads them has taken from a pipe.
+def _take_tasks(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
+    """Results of tasks by number; numbers are read from a pipe that all processes share.
 
-    Tasks that raise an error have none: they are done again in the end, so that the first of them
-    raises it, whoever has met it.
+    Tasks that raise an exception have no result: the parent runs them again, in order, so that the
+    exception of the first one is raised.
     """
     results = dict[int, _T]()
     while number := os.read(source, 2):
@@ -179,29 +178,29 @@ def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
     return results
 
 
-_CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
+_CPU = getattr(signal, "SIGPROF", 27)  # signal at the limit of processor time
 
 
 class DiedError(Exception):
-    """A task has lost its process, each time that it was tried; `late` if its time was up."""
+    """The process of a task died in every attempt; `timed_out` if it exceeded its time limit."""
 
-    def __init__(self, text: str, late: bool = False) -> None:
+    def __init__(self, text: str, timed_out: bool = False) -> None:
         super().__init__(text)
-        self.late = late
+        self.timed_out = timed_out
 
 
 def run_all(
-    run: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor, ahead: int = 64
+    run: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor, max_pending: int = 64
 ) -> Iterator[tuple[Any, Any]]:
-    """Each task and what `run` returns for it, or the exception that it raises, as they end.
+    """Pairs of a task and the result of `run`, or its exception, in the order of completion.
 
-    `run` is of a module, as workers import it by name; tasks have to be picklable. The executor is
-    shut down at the end. No more than `ahead` tasks are submitted at a time.
+    `run` is a function of a module, as workers import it by name; tasks have to be picklable. At
+    most `max_pending` tasks are submitted at a time. The executor is shut down at the end.
     """
-    waiting, pending = iter(tasks), dict[Future[Any], Any]()
+    remaining, pending = iter(tasks), dict[Future[Any], Any]()
     try:
         while True:
-            for task in islice(waiting, ahead - len(pending)):
+            for task in islice(remaining, max_pending - len(pending)):
                 pending[executor.submit(run, task)] = task
             if not pending:
                 return
@@ -209,39 +208,39 @@ def run_all(
                 task, error = pending.pop(future), future.exception()
                 yield task, future.result() if error is None else error
     finally:
-        # Not every executor can be told at once to do nothing more.
+        # Not every executor cancels pending futures at its shutdown.
         for future in pending:
             future.cancel()
         executor.shutdown(wait=False)
 
 
 class Processes(ThreadPoolExecutor):
-    """Spawned processes, each led by a thread. One that dies or hangs costs its own task alone.
+    """Executor of spawned processes, each with a thread; a crash or a hang affects one task only.
 
-    There are as many as `jobs`, or cores. A task may take `limit` of processor time [s], and 20
-    times that by the wall clock, as others may run too. Tasks that run `alone` have new processes.
-    Futures raise `DiedError` where a task loses its process three times, or its time is up.
+    There are `jobs` processes, or as many as cores. A task may take `limit(task)` of processor time
+    [s] and 20 times as much wall-clock time. With `fresh`, each task has a new process. Futures
+    raise `DiedError` if the process of a task dies three times, or its time limit is exceeded.
     """
 
     def __init__(
         self,
         jobs: int | None = None,
         limit: Callable[[Any], float] = lambda task: math.inf,
-        alone: bool = False,
+        fresh: bool = False,
     ) -> None:
         super().__init__(jobs or os.cpu_count())
-        self._limit, self._alone = limit, alone
+        self._limit, self._fresh = limit, fresh
         self._idle, self._workers = list[_Worker](), set[_Worker]()
         self._closed = False
 
     def submit(  # type: ignore[override]
         self, run: Callable[[Any], Any], task: Any, /
     ) -> Future[Any]:
-        """Have a process compute `run(task)`."""
-        return super().submit(self._lead, run, task)
+        """Submit `run(task)` to a process."""
+        return super().submit(self._run_task, run, task)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """End all processes, whatever they do, and their threads."""
+        """Kill all processes and end their threads."""
         self._closed = True
         super().shutdown(wait=False, cancel_futures=True)
         for worker in list(self._workers):
@@ -250,9 +249,9 @@ class Processes(ThreadPoolExecutor):
         while self._idle:
             self._idle.pop().end()
 
-    def _lead(self, run: Callable[[Any], Any], task: Any) -> Any:
-        """The result of a task, by a process that this thread has for itself meanwhile."""
-        for chance in (1, 2, 3):
+    def _run_task(self, run: Callable[[Any], Any], task: Any) -> Any:
+        """The result of a task, computed in an idle or a new process; up to three attempts."""
+        for attempt in (1, 2, 3):
             worker = self._idle.pop() if self._idle else _Worker()
             self._workers.add(worker)
             reusable = False
@@ -260,10 +259,10 @@ class Processes(ThreadPoolExecutor):
                 if self._closed:
                     raise DiedError("the executor is shut down")
                 succeeded, result = worker.ask(run, task, self._limit(task))
-                reusable = not self._alone
+                reusable = not self._fresh
                 break
             except DiedError as error:
-                if error.late or self._closed or chance == 3:
+                if error.timed_out or self._closed or attempt == 3:
                     raise
             finally:
                 if reusable:
@@ -276,18 +275,18 @@ class Processes(ThreadPoolExecutor):
         raise result
 
 
-class _Spawned(SpawnProcess):
-    """A process that a Ctrl-C in its terminal leaves to its parent, from the first moment on.
+class _SpawnedProcess(SpawnProcess):
+    """A spawned process that ignores Ctrl-C in its terminal from the start; its parent handles it.
 
-    The script that started this process is not imported in it, which would run it again.
+    The main script is not imported, as this would run it again.
     """
 
     def start(self) -> None:
-        # The first process starts this one, too, which would unblock SIGINT.
+        # The first start would also start the resource tracker, which unblocks SIGINT.
         if sys.platform != "win32":
             resource_tracker.ensure_running()
-        # What a signal ends has to be known by then; and one is started at a time.
-        with held(), _blocked(signal.SIGINT):
+        # A signal handler has to know the process; and one process is started at a time.
+        with defer_signals(), _block_signals(signal.SIGINT):
             main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
             try:
                 super().start()
@@ -296,28 +295,30 @@ class _Spawned(SpawnProcess):
 
 
 class _Worker:
-    """A process that computes what comes through a pipe."""
+    """A process that runs tasks that it receives through a pipe."""
 
     def __init__(self) -> None:
-        self.pipe, far = mp.Pipe()
-        self.process = _Spawned(target=_work, args=(far, os.getpid()), daemon=True)
+        self.pipe, remote = mp.Pipe()
+        self.process = _SpawnedProcess(target=_work, args=(remote, os.getpid()), daemon=True)
         self.process.start()
-        far.close()
+        remote.close()
 
     def ask(self, run: Callable[[Any], Any], task: Any, limit: float) -> tuple[bool, Any]:
         """Whether a task succeeded, and its result or its exception."""
-        start_time, late = time.monotonic(), False
+        start_time, timed_out = time.monotonic(), False
         try:
             self.pipe.send((run, task, limit))
             if self.pipe.poll(20.0 * limit if math.isfinite(limit) else None):
                 succeeded, result = self.pipe.recv()
                 return succeeded, result
-            late = True
+            timed_out = True
         except (EOFError, OSError):
             self.process.join()
-            late = self.process.exitcode == -_CPU
-        kind, elapsed = "time limit" if late else "crash", time.monotonic() - start_time
-        raise DiedError(f"{kind} after {elapsed:.0f} s: exit status {self.process.exitcode}", late)
+            timed_out = self.process.exitcode == -_CPU
+        cause, elapsed = "time limit" if timed_out else "crash", time.monotonic() - start_time
+        raise DiedError(
+            f"{cause} after {elapsed:.0f} s: exit status {self.process.exitcode}", timed_out
+        )
 
     def end(self) -> None:
         """End the process."""
@@ -327,14 +328,14 @@ class _Worker:
 
 
 def _work(pipe: Connection, parent: int) -> None:
-    """Compute what comes through the pipe until it closes."""
+    """Run tasks received through the pipe until it closes."""
     end_with_parent(parent)
     try:
         import resource
 
-        # A claim beyond 6 GB fails instead of swapping.
-        most, hard = 6 * 2**30, resource.getrlimit(resource.RLIMIT_AS)[1]
-        soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        # Allocations beyond 6 GB fail instead of swapping.
+        max_bytes, hard = 6 * 2**30, resource.getrlimit(resource.RLIMIT_AS)[1]
+        soft = max_bytes if hard == resource.RLIM_INFINITY else min(max_bytes, hard)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
     except ImportError:  # on Windows
         pass
@@ -344,7 +345,7 @@ def _work(pipe: Connection, parent: int) -> None:
         except (EOFError, OSError):
             return
         if hasattr(signal, "setitimer") and math.isfinite(limit):
-            # A limit of the whole process would drift; this one idles between tasks.
+            # A timer per task: a limit of the process would sum over its tasks.
             signal.setitimer(signal.ITIMER_PROF, limit)
         try:
             answer = True, run(task)
@@ -376,16 +377,15 @@ def connect(address: str, patience: float = 10.0) -> Executor:
 
 
 class Journal:
-    """A file of one JSON object per line, begun by a line that says what the study is.
+    """A file with one JSON object per line; the first line, the stamp, identifies the study.
 
-    Nothing in the file is lost unless that is asked for. While the journal exists nobody else can
-    have one of the same file. Only a regular file has records: `os.devnull` stands for none. The
-    `stamp` is what the records belong to, its `study` their kind. A `fresh` file is begun anew,
-    whatever it holds; with `again`, records with findings are dropped, so that their tasks are run
-    again. Where the stamp has a `source` records of another one are none.
+    Records are kept unless `fresh` or `again` is set: `fresh` starts an empty file, `again` drops
+    records with findings, so that their tasks are run again. The file is locked while the journal
+    exists. `os.devnull` stands for no file. The key `study` of the stamp is the kind of study.
+    Records of a stamp with another `source` are dropped.
 
-    InputError if the file holds something else, another study of the same kind included, or is
-    being written by another run, or cannot be written.
+    InputError if the file holds something else, another study of the same kind included, is being
+    written by another run, or cannot be written.
     """
 
     def __init__(
@@ -398,7 +398,7 @@ class Journal:
             try:
                 if stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
                     if fcntl is not None:
-                        # Keeps others from the file until it is closed, or this process ends.
+                        # Locks the file until it is closed, or this process ends.
                         fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
                     self._stream.seek(0)
                     self._begin(b"" if fresh else self._stream.read(), again)
@@ -418,45 +418,45 @@ class Journal:
         self._stream.close()
 
     def add(self, record: dict[str, Any]) -> None:
-        """Keep a record; an `InputError` if it cannot be written."""
+        """Append a record; an `InputError` if it cannot be written."""
         self.records.append(record)
         with name_file(self.path, failure="cannot be written"):
             self._write((json.dumps(record) + "\n").encode())
 
-    def _begin(self, given: bytes, again: bool) -> None:
-        """Take the records that are there, and leave whole lines, begun by the stamp."""
+    def _begin(self, content: bytes, again: bool) -> None:
+        """Read the records, and truncate the file to the stamp and complete lines."""
         head = (json.dumps(self._stamp) + "\n").encode()
-        whole, other, kind = head, _parse(given.split(b"\n", 1)[0]), self._stamp["study"]
+        lines_kept, other, kind = head, _parse(content.split(b"\n", 1)[0]), self._stamp["study"]
         if other.get("study") == kind and other.get("source") != self._stamp.get("source"):
-            given = b""
-        # Half of the first line is what a full disk leaves.
-        if not head.startswith(given):
+            content = b""
+        # A full disk may leave a part of the first line.
+        if not head.startswith(content):
             differences = find_differences(other, self._stamp)
             if text := describe_differences(differences, "in the file", "now"):
                 same = other.get("study") == kind
                 what = f"another study: {text}" if same else f"no {kind} study"
                 text = f"holds {what}; --fresh begins anew, or choose another with -o"
                 raise InputError(self.path, "", text)
-            first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
+            first, *lines = content[: content.rfind(b"\n") + 1].splitlines(keepends=True)
             entries = [(line, _parse(line)) for line in lines]
-            kept = [entry for entry in entries if not (again and entry[1].get("findings"))]
-            self.records = [record for _, record in kept if record]
-            whole = b"".join([first, *(line for line, _ in kept)])
-        with held():
-            if given.startswith(whole):
-                self._stream.truncate(len(whole))
+            selected = [entry for entry in entries if not (again and entry[1].get("findings"))]
+            self.records = [record for _, record in selected if record]
+            lines_kept = b"".join([first, *(line for line, _ in selected)])
+        with defer_signals():
+            if content.startswith(lines_kept):
+                self._stream.truncate(len(lines_kept))
             else:
                 self._stream.truncate(0)
-                self._write(whole)
+                self._write(lines_kept)
 
     def _write(self, line: bytes) -> None:
-        left = memoryview(line)
-        while left:
-            left = left[self._stream.write(left) :]
+        remaining = memoryview(line)
+        while remaining:
+            remaining = remaining[self._stream.write(remaining) :]
 
 
 def _parse(line: bytes) -> dict[str, Any]:
-    """The record of a line; empty if it is none."""
+    """The record of a line; empty if the line is no JSON object."""
     try:
         record = json.loads(line)
     except ValueError:

@@ -1,9 +1,9 @@
-"""One thread at a time: CasADi counts references, and keeps tables, without locks of its own.
+"""A lock around CasADi, whose reference counts and tables are not thread-safe.
 
-Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
-uses CasADi holds one lock (`exclusive`), and what it leaves behind is never deleted outside of it:
-what is built of an object is kept elsewhere (`stored`), and an error that leaves the package takes
-no local variables along.
+Its wrapper releases Python's lock during every call, even while an object is deleted. Functions
+that use CasADi hold a lock of the package (`exclusive`), and CasADi objects are deleted only under
+this lock: expressions and functions are stored in caches (`stored`), and local variables are
+removed from the tracebacks of errors.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from .arrays import Array, Expression
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
-LOCK = RLock()  # held by whoever uses CasADi
-KEPT = 512  # most values of a `stored` function; a route of a polygon with 12 corners takes 180
+LOCK = RLock()  # held during every use of CasADi
+MAX_STORED = 512  # entries of a cache; a route of a polygon with 12 corners takes 180
 
 if hasattr(os, "register_at_fork"):
-    # A child process must not start from the middle of another thread's call.
+    # A child process must not be forked during a call of another thread.
     os.register_at_fork(
         before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release
     )
 
 
 def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Make a function hold the lock; it may call others that do."""
+    """Decorator: the function holds the lock, which is reentrant."""
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
@@ -41,18 +41,18 @@ def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
             try:
                 return function(*args, **kwargs)
             except BaseException as error:
-                _drop_locals(error)
+                _clear_locals(error)
                 raise
 
     return run
 
 
 def stored(
-    identify: Callable[..., Hashable], most: int = KEPT
+    identify: Callable[..., Hashable], max_size: int = MAX_STORED
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
-    """Have a function keep what it builds of CasADi objects, `most` values that were used last.
+    """Decorator: cache the `max_size` values of a function of CasADi objects that were used last.
 
-    Arguments for which `identify` gives equal keys share one value.
+    The key of a value is `identify` of the arguments.
     """
 
     def decorate(build: Callable[..., _T]) -> Callable[..., _T]:
@@ -65,7 +65,7 @@ def stored(
             if key not in values:
                 values[key] = build(*owners)
             values.move_to_end(key)
-            if len(values) > most:
+            if len(values) > max_size:
                 values.popitem(last=False)
             return values[key]
 
@@ -74,26 +74,26 @@ def stored(
     return decorate
 
 
-def _drop_locals(error: BaseException) -> None:
-    """Delete the local variables of all finished calls that an error and its causes came through.
+def _clear_locals(error: BaseException) -> None:
+    """Delete the local variables in the tracebacks of an error and its causes.
 
-    They may hold CasADi objects, and the error is dropped where nobody holds the lock.
+    They may hold CasADi objects, which would be deleted with the error without the lock.
     """
     from traceback import clear_frames  # no plan needs it
 
-    seen: set[int] = set()
+    visited: set[int] = set()
     pending: list[BaseException | None] = [error]
     while pending:
-        one = pending.pop()
-        if one is None or id(one) in seen:
+        current = pending.pop()
+        if current is None or id(current) in visited:
             continue
-        seen.add(id(one))
-        pending += [one.__cause__, one.__context__]
-        clear_frames(one.__traceback__)
+        visited.add(id(current))
+        pending += [current.__cause__, current.__context__]
+        clear_frames(current.__traceback__)
 
 
 def bind(function: Expression, inputs: Sequence[Array], outputs: Sequence[Array]) -> Any:
-    """A call of a CasADi function of dense arrays, which stay in place and live as long."""
+    """A call of a CasADi function on fixed buffers: dense arrays, which the call keeps alive."""
     buffer, call = function.buffer()
     for k, values in enumerate(inputs):
         buffer.set_arg(k, values.data)
@@ -107,20 +107,20 @@ def bind(function: Expression, inputs: Sequence[Array], outputs: Sequence[Array]
 class Batch:
     """A CasADi function of column vectors, called on rows of NumPy arrays.
 
-    CasADi reads from and writes to arrays that stay in place, which is several times as fast as
-    passing matrices in and out. Up to 5 points are calls of their own: one for 20 costs as much as
-    half a dozen. More than 64 in a call need more memory at no gain. Inputs of the `function`,
-    which is kept, are column vectors, outputs are dense.
+    CasADi reads from and writes to fixed buffers, which is several times as fast as passing
+    matrices. Up to 5 points are evaluated one by one: a call for 20 takes as long as six. Calls
+    for more than 64 need more memory without a gain. Inputs of the `function` are column vectors,
+    outputs are dense.
     """
 
     sizes = (1, 20, 64)  # points of a call
 
     def __init__(self, function: Expression) -> None:
-        self.function, most, inputs = function, self.sizes[-1], range(function.n_in())
-        self._arguments = [np.zeros((most, function.size1_in(i))) for i in inputs]
+        self.function, size_limit, inputs = function, self.sizes[-1], range(function.n_in())
+        self._arguments = [np.zeros((size_limit, function.size1_in(i))) for i in inputs]
         shapes = [function.size_out(i) for i in range(function.n_out())]
-        self._results = [np.zeros((most, columns, rows)) for rows, columns in shapes]
-        self._calls = []  # a number of points, and a call for as many
+        self._results = [np.zeros((size_limit, columns, rows)) for rows, columns in shapes]
+        self._calls = []  # pairs of a number of points and a call for as many
         for size in self.sizes:
             inner, outer = ([x[:size] for x in y] for y in (self._arguments, self._results))
             call = bind(function if size == 1 else function.map(size), inner, outer)
@@ -136,8 +136,8 @@ class Batch:
         outputs = [np.empty((count, *result.shape[1:])) for result in self._results]
         stop = 0
         while stop < count:
-            start, left = stop, count - stop
-            size, run = self._calls[0 if left <= 5 else 1 if left <= 60 else 2]
+            start, remaining = stop, count - stop
+            size, run = self._calls[0 if remaining <= 5 else 1 if remaining <= 60 else 2]
             stop = min(start + size, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
                 store[: stop - start] = argument[start:stop]
@@ -148,7 +148,7 @@ class Batch:
 
     @exclusive
     def at(self, *point: Array) -> list[Array]:
-        """Evaluate at one point, with the least to do besides.
+        """Evaluate at one point, with the least overhead.
 
         Each input has a `point` of shape (rows,), each output is (columns, rows).
         """

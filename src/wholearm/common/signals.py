@@ -1,9 +1,9 @@
-"""SIGINT and SIGTERM end a command at once, wherever it is.
+"""Handlers of SIGINT and SIGTERM, which end a command at once; time limits; progress.
 
-The handler removes temporary files, ends child processes, says why and leaves the process. It
-raises nothing: CasADi goes on after an exception that a handler raises inside its code, or crashes
-(2 of 800 interrupted plannings with 3.7.0). Signals wait while files that belong together are moved
-(`held`), and a search is told of the first SIGINT at its next `beat` (`yielding`).
+The handler removes temporary files, kills child processes, prints the reason and exits. It raises
+nothing: CasADi ignores an exception that a handler raises inside its code, or crashes (2 of 800
+interrupted plannings with 3.7.0). Signals are deferred while files of a group are moved
+(`defer_signals`); in a search the first SIGINT is raised at the next `beat` (`interrupt_at_beat`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
-_WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-_ending = threading.RLock()
-"""Held while something is done that may not be left half done, ending the process included."""
+_REASONS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+_end_lock = threading.RLock()
+"""Held during operations that must not be interrupted, the end of the process included."""
 _holder: int | None = None  # thread that holds it
-_received: int | None = None
-_yielding = _stopping = False
+_pending: int | None = None
+_deferring = _stopping = False
 _cleanups: list[Callable[[], object]] = []
 _listeners: list[Callable[[], object]] = []
 _deadline: float | None = None
@@ -33,50 +33,50 @@ _deadline: float | None = None
 def guard(run: Callable[[], int]) -> None:
     """Run a command, and end the process with its exit status, or with 128 + a signal's number."""
     try:
-        for number in _WORDS:
-            # A shell lets background jobs ignore SIGINT, which is not for us to change.
+        for number in _REASONS:
+            # A shell may start background jobs with SIGINT ignored; that stays.
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 signal.signal(number, _interrupt)
         status = run()
     except KeyboardInterrupt:
-        # It came before the handler was in place.
+        # The signal came before the handler was installed.
         _end_by(signal.SIGINT)
-    # What the command had to do is done, and exiting takes a moment.
-    for number in _WORDS:
+    # The command is complete; a signal during exit would change its status.
+    for number in _REASONS:
         signal.signal(number, signal.SIG_IGN)
-    _leave(status)
+    _exit(status)
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
     """Handle a signal."""
-    global _received, _stopping
-    if _yielding and not _stopping and number == signal.SIGINT:
+    global _pending, _stopping
+    if _deferring and not _stopping and number == signal.SIGINT:
         _stopping = True
     elif _holder == threading.get_ident():
-        _received = _received or number
+        _pending = _pending or number
     else:
         _end_by(number)
 
 
 def _end_by(number: int) -> NoReturn:
     """End the process because of a signal."""
-    with _ending:
+    with _end_lock:
         # A second one often follows the first at once.
-        for other in _WORDS:
+        for other in _REASONS:
             signal.signal(other, signal.SIG_IGN)
-        # It may have come in the middle of printing.
+        # The signal may have interrupted a print.
         for cleanup in _cleanups:
             with suppress(OSError, RuntimeError):
                 cleanup()
         with suppress(OSError):
-            os.write(2, f"wholearm: {_WORDS[signal.Signals(number)]}\n".encode())
-        _leave(128 + number, flush=False)
+            os.write(2, f"wholearm: {_REASONS[signal.Signals(number)]}\n".encode())
+        _exit(128 + number, flush=False)
 
 
-def _leave(status: int, flush: bool = True) -> NoReturn:
+def _exit(status: int, flush: bool = True) -> NoReturn:
     """End the process without deleting every object, which takes a tenth of a short command."""
-    # `atexit` waits for children, and nothing tells those of a study that was left to end. The
-    # thread that looks after them may be surprised, which nobody is to read.
+    # `atexit` would wait for children of an interrupted study. Exceptions of the threads that
+    # serve them are not printed.
     threading.excepthook = lambda _: None
     end_children()
     atexit._run_exitfuncs()
@@ -93,42 +93,42 @@ def end_children() -> None:
         child.kill()
 
 
-def on_end(cleanup: Callable[[], object]) -> None:
-    """Register what has to be cleaned up when a signal ends a command."""
+def register_cleanup(cleanup: Callable[[], object]) -> None:
+    """Register a function to be called when a signal ends a command."""
     _cleanups.append(cleanup)
 
 
 @contextmanager
-def held() -> Iterator[None]:
-    """Have signals wait while something is done that may not be left half done."""
+def defer_signals() -> Iterator[None]:
+    """Defer signals to the end of this context, which must not be interrupted."""
     global _holder
-    with _ending:
-        outer, _holder = _holder, threading.get_ident()
+    with _end_lock:
+        outer_holder, _holder = _holder, threading.get_ident()
         try:
             yield
         finally:
-            _holder = outer
-            if _received is not None and outer is None:
-                _end_by(_received)
+            _holder = outer_holder
+            if _pending is not None and outer_holder is None:
+                _end_by(_pending)
 
 
 @contextmanager
-def yielding() -> Iterator[None]:
-    """Have the first SIGINT only raise KeyboardInterrupt, at the next `beat` or at the end."""
-    global _yielding, _stopping
-    _yielding = True
+def interrupt_at_beat() -> Iterator[None]:
+    """Raise KeyboardInterrupt on the first SIGINT at the next `beat` or at the end, not at once."""
+    global _deferring, _stopping
+    _deferring = True
     try:
         yield
         check()
     finally:
-        _yielding = _stopping = False
+        _deferring = _stopping = False
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Have SIGINT raise KeyboardInterrupt at the next `beat`, too: CasADi may drop the first one.
+    """Raise KeyboardInterrupt on SIGINT at the next `beat`, too: CasADi may drop the first one.
 
-    That is for programs with the handler of Python, which raises it once.
+    Only in programs with Python's default handler, which raises it once.
     """
     global _stopping
     handler, main = signal.default_int_handler, threading.main_thread()
@@ -151,55 +151,55 @@ def interruptible() -> Iterator[None]:
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if a signal asks for the end of what is done here (`yielding`)."""
+    """Raise KeyboardInterrupt after a SIGINT (`interrupt_at_beat`, `interruptible`)."""
     if _stopping:
         raise KeyboardInterrupt
 
 
 class OutOfTime(KeyboardInterrupt):
-    """A time limit is over. Like an interrupt, it is no error that work may go on after."""
+    """A time limit is over. Like an interrupt, it is not caught as an error."""
 
 
 @contextmanager
-def limited(seconds: float | None) -> Iterator[None]:
-    """Have `beat` raise OutOfTime once so many seconds are over; None leaves an outer limit."""
+def limit_time(seconds: float | None) -> Iterator[None]:
+    """Time limit of this context: `beat` raises OutOfTime after it; None keeps an outer limit."""
     global _deadline
     if seconds is None:
         yield
         return
-    # It needs NumPy, which bad input on a command line does not wait for.
+    # Imported here, so that messages about a wrong command line need not wait for NumPy.
     from .errors import require_number
 
     end = time.monotonic() + require_number(seconds, "time_limit", positive=True)
-    outer, _deadline = _deadline, end if _deadline is None else min(end, _deadline)
+    outer_deadline, _deadline = _deadline, end if _deadline is None else min(end, _deadline)
     try:
         yield
     finally:
-        _deadline = outer
+        _deadline = outer_deadline
 
 
-def listen(heard: Callable[[], object]) -> None:
-    """Have something called at every beat."""
-    _listeners.append(heard)
+def listen(listener: Callable[[], object]) -> None:
+    """Register a function to be called at every beat."""
+    _listeners.append(listener)
 
 
 def beat() -> None:
-    """Tell listeners that work goes on, and end it with OutOfTime if its time is over."""
+    """Call the listeners; raise OutOfTime if the time limit is over."""
     check()
-    for heard in _listeners:
-        heard()
+    for listener in _listeners:
+        listener()
     if _deadline is not None and time.monotonic() > _deadline:
         raise OutOfTime
 
 
 class Reporter:
-    """Passes on what is being done, and remembers it as `last`."""
+    """Calls `progress` with each text, and stores it as `last`."""
 
     def __init__(self, progress: Callable[[str], None] | None) -> None:
         self._progress, self.last = progress, "begun"
 
     def __call__(self, text: str) -> None:
-        """Tell it."""
+        """Report a text."""
         self.last = text
         if self._progress is not None:
             self._progress(text)

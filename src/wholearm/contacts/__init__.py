@@ -1,1 +1,1 @@
-"""Elemental contacts, slip, formations, what gaps stay open, friction cones."""
+"""Elemental contacts, slip coordinates, formations, gap limits, closed configurations."""

@@ -1,4 +1,4 @@
-"""Gap limits of a contact formation: ranges of its contacts, other features, link against link."""
+"""Gap limits of a formation: ranges of its contacts, clearances of other features, of the links."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..common.sharing import Batch, stored
 from ..scene.model import Scene
 from .elemental import Contact, GapLimit, build_features, candidate_contacts
 
-FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
+FINGERS_TOUCH = "finger 1 touches finger 2"  # text of the limit of the gap between the links
 ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
 
 
@@ -31,17 +31,17 @@ def separate(first: Expression, second: Expression, size: Expression) -> Express
     """
     parts = []
     for body, other in ((first, second), (second, first)):
-        along = ca.horzcat(body[:, 1:], body[:, 0]) - body
-        outward = ca.vertcat(along[1, :], -along[0, :])
-        levels = outward.T @ other - ca.repmat(ca.sum1(outward * body).T, 1, other.shape[1])
-        nearest = reduce(ca.fmin, ca.horzsplit(levels))
-        parts.append(nearest / ca.hypot(along[0, :], along[1, :]).T)
+        edges = ca.horzcat(body[:, 1:], body[:, 0]) - body
+        outward = ca.vertcat(edges[1, :], -edges[0, :])
+        heights = outward.T @ other - ca.repmat(ca.sum1(outward * body).T, 1, other.shape[1])
+        nearest = reduce(ca.fmin, ca.horzsplit(heights))
+        parts.append(nearest / ca.hypot(edges[0, :], edges[1, :]).T)
     for corner in ca.horzsplit(second):
-        runs, others = (body - ca.repmat(corner, 1, body.shape[1]) for body in (first, second))
-        distance = ca.sqrt(ca.sum1(runs**2) + ROUNDING * size**2).T
+        vectors, others = (body - ca.repmat(corner, 1, body.shape[1]) for body in (first, second))
+        distance = ca.sqrt(ca.sum1(vectors**2) + ROUNDING * size**2).T
         nearest, farthest = (
-            reduce(choose, ca.horzsplit(runs.T @ points))
-            for choose, points in ((ca.fmin, runs), (ca.fmax, others))
+            reduce(extreme, ca.horzsplit(vectors.T @ points))
+            for extreme, points in ((ca.fmin, vectors), (ca.fmax, others))
         )
         parts.append((nearest - farthest) / distance)
     return ca.mmax(ca.vertcat(*parts))
@@ -69,48 +69,48 @@ def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
     limits = [limit for c in contacts for limit in build_limits(c, scene)]
     for finger in (None, 0, 1):
-        held = [contact for contact in contacts if contact.finger == finger]
-        limits += _list_clearances(scene, finger, held)
+        closed = [contact for contact in contacts if contact.finger == finger]
+        limits += _list_clearances(scene, finger, closed)
     if scene.fingers_collide:
         limits.append(GapLimit(build_finger_gap(scene), FINGERS_TOUCH))
     return limits
 
 
-def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[GapLimit]:
-    """Limits of the features that do not touch a part of the hand whose contacts are `held`."""
-    on_side = {contact.index for contact in held if contact.surface == "finger"}
+def _list_clearances(scene: Scene, finger: int | None, closed: Sequence[Contact]) -> list[GapLimit]:
+    """Clearances of the features that do not touch a part of the hand with `closed` contacts."""
+    side = {contact.index for contact in closed if contact.surface == "finger"}
     count = scene.polygon.n_vertices
-    # A link that touches a vertex can only turn onto the edge that leads from it to the tip;
-    # one whose tip touches an edge is outside the edge's line, and only the end of the edge
-    # that is behind the tip can come to its side.
-    ahead = {(index - (finger or 0)) % count for index in on_side}
-    tips = [contact for contact in held if contact.surface == "tip"]
-    behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
+    # A link that touches a vertex can only turn onto the edge from this vertex towards the tip.
+    # A link whose tip touches an edge is outside the edge's line; only the end of the edge behind
+    # the tip can reach its side.
+    next_edges = {(index - (finger or 0)) % count for index in side}
+    tips = [contact for contact in closed if contact.surface == "tip"]
+    end_vertices = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
 
     def may_touch(contact: Contact) -> bool:
         on_tip = contact.surface == "tip"
-        if on_side:
-            return not on_tip or (contact.feature == "e" and contact.index in ahead)
-        return not tips or (not on_tip and contact.index in behind)
+        if side:
+            return not on_tip or (contact.feature == "e" and contact.index in next_edges)
+        return not tips or (not on_tip and contact.index in end_vertices)
 
-    contacts = [c for c in candidate_contacts(scene, finger) if c not in held and may_touch(c)]
-    if finger is not None and not held:
+    contacts = [c for c in candidate_contacts(scene, finger) if c not in closed and may_touch(c)]
+    if finger is not None and not closed:
         kinds = [("v", "back"), ("e", "joint"), ("v", "joint")]
         kinds = kinds if scene.fingers[finger].radius > 0 else kinds[:2]
         contacts += [Contact(kind, i, part, finger) for kind, part in kinds for i in range(count)]
-    elif all((c.surface, c.feature) == ("tip", "e") for c in held):
-        for contact in held:
+    elif all((c.surface, c.feature) == ("tip", "e") for c in closed):
+        for contact in closed:
             end = (contact.index + 1 - (finger or 0)) % count
             contacts += [Contact("v", end, "back", finger), replace(contact, surface="joint")]
     limits = [
-        build_clearance(c, scene, bool(held if c.surface == "joint" else on_side)) for c in contacts
+        build_clearance(c, scene, bool(closed if c.surface == "joint" else side)) for c in contacts
     ]
-    if finger is None or held:
+    if finger is None or closed:
         return limits
-    # The object may be on either side of the link: gaps count where they overlap nowhere else.
-    apart, pairs = build_apart(scene, finger), build_features(scene).pairs
+    # The object may be on either side of the link: other gaps count where the bodies are apart.
+    distance, pairs = build_distance(scene, finger), build_features(scene).pairs
     return [
-        limit._replace(value=ca.fmax(limit.value, apart - pairs[c].gap / 2))
+        limit._replace(value=ca.fmax(limit.value, distance - pairs[c].gap / 2))
         if c.surface in ("finger", "back")
         else limit
         for c, limit in zip(contacts, limits, strict=True)
@@ -119,9 +119,9 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
 
 @stored(lambda contact, scene: (contact, scene.shape))
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
-    """Return the limits of one contact's own range: between base and tip, between two vertices.
+    """Return the limits of the range of one contact: between base and tip, or two vertices.
 
-    Where the range goes over into that of a neighbour, the neighbour is the contact gained.
+    If the range of a neighbouring contact begins there, that contact is gained.
     """
     finger = contact.finger
     if finger is None:
@@ -131,51 +131,51 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     before, after = (i - 1) % count, (i + 1) % count
     pointed = scene.fingers[finger].radius == 0
 
-    def gains(feature: str, index: int, surface: str = "tip") -> Contact | None:
+    def make_contact(feature: str, index: int, surface: str = "tip") -> Contact | None:
         if (feature, surface) == ("v", "tip") and pointed:
             return None
         return Contact(feature, index, surface, finger)
 
-    def meeting(vertex: int) -> tuple[Contact, ...]:
-        """What else a pointed tip touches at a vertex."""
+    def list_others(vertex: int) -> tuple[Contact, ...]:
+        """Other contacts of a pointed tip at a vertex."""
         side = Contact("v", vertex, "finger", finger)
         edges = [Contact("e", (vertex - k) % count, "tip", finger) for k in (0, 1)]
         return tuple(c for c in (side, *edges) if c != contact) if pointed else ()
 
     if contact.surface == "finger":
-        off = f"v{i} runs off {part} at its"
+        text = f"v{i} runs off {part} at its"
         return [
-            GapLimit(ranges[0], f"{off} base"),
-            GapLimit(ranges[1], f"{off} tip", gains("v", i), meeting(i)),
+            GapLimit(ranges[0], f"{text} base"),
+            GapLimit(ranges[1], f"{text} tip", make_contact("v", i), list_others(i)),
         ]
     if contact.feature == "e":
-        off = f"{part} runs off edge {i} at v"
+        text = f"{part} runs off edge {i} at v"
         return [
-            GapLimit(ranges[0], f"{off}{i}", gains("v", i), meeting(i)),
-            GapLimit(ranges[1], f"{off}{after}", gains("v", after), meeting(after)),
+            GapLimit(ranges[0], f"{text}{i}", make_contact("v", i), list_others(i)),
+            GapLimit(ranges[1], f"{text}{after}", make_contact("v", after), list_others(after)),
         ]
-    # Both sides of the link begin where the arc ends.
-    beyond, turned_before, turned = ranges
+    # The arc ends at both sides of the link.
+    axial, before_range, after_range = ranges
     side = pairs[replace(contact, surface="finger")].gap + scene.fingers[finger].radius
-    off = f"v{i} leaves {part} for the"
+    text = f"v{i} leaves {part} for the"
     return [
-        GapLimit(ca.fmax(beyond, -side), f"{off} side of the link", gains("v", i, "finger")),
-        GapLimit(ca.fmax(beyond, side), f"{off} far side of the link"),
-        GapLimit(turned_before, f"edge {before} turns onto {part}", gains("e", before)),
-        GapLimit(turned, f"edge {i} turns onto {part}", gains("e", i)),
+        GapLimit(ca.fmax(axial, -side), f"{text} side of the link", make_contact("v", i, "finger")),
+        GapLimit(ca.fmax(axial, side), f"{text} far side of the link"),
+        GapLimit(before_range, f"edge {before} turns onto {part}", make_contact("e", before)),
+        GapLimit(after_range, f"edge {i} turns onto {part}", make_contact("e", i)),
     ]
 
 
-def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
-    """Whether `contact` is the neighbour of one of `held` at the end of its range."""
-    limits = (limit for contact in held for limit in build_limits(contact, scene))
+def takes_over(contact: Contact, scene: Scene, contacts: Sequence[Contact]) -> bool:
+    """Whether `contact` is the neighbour of one of `contacts` at the end of its range."""
+    limits = (limit for contact in contacts for limit in build_limits(contact, scene))
     return any(limit.gained == contact for limit in limits)
 
 
 def list_renamed(
     scene: Scene, before: Sequence[Contact], after: Sequence[Contact]
 ) -> dict[Contact, Contact]:
-    """Contacts that go on as those of a neighbouring feature, which their normals agree with."""
+    """Contacts that continue as those of a neighbouring feature, with the same normal."""
     return {
         old: new
         for old, new in product(before, after)
@@ -185,10 +185,10 @@ def list_renamed(
 
 @stored(lambda contact, scene, touching: (contact, scene.shape, touching))
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
-    """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
+    """Limit at which `contact`, not in the formation, is gained; it counts within its range only.
 
-    With a link that is `touching` a vertex with its side they do, by convexity; as does the gap of
-    a joint with the edge that the tip touches, wherever other edges are.
+    If the side of the link is `touching` a vertex, it counts everywhere, by convexity; so does the
+    gap between the joint and the edge that the tip touches.
     """
     pair = build_features(scene).pairs[contact]
     gained = contact if contact.surface in ("palm", "finger", "tip") else None
@@ -197,8 +197,8 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     gap, ranges = pair.gap, pair.ranges
     if (contact.feature, contact.surface) == ("v", "tip"):
         ranges = tuple(limit.value for limit in build_limits(contact, scene))
-    for inside in ranges:
-        gap = ca.fmax(gap, -inside)
+    for range_value in ranges:
+        gap = ca.fmax(gap, -range_value)
     if contact.feature == "e" and not touching:
         others = _list_other_gaps(scene)[contact.surface, contact.finger]
         gap = ca.fmax(gap, others[contact.index] - pair.gap)
@@ -207,18 +207,18 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
 
 @stored(lambda scene: scene.shape)
 def _list_other_gaps(scene: Scene) -> dict[tuple[str, int], list[Expression]]:
-    """For each edge the largest gap of all others, by the end of which link; by running maxima."""
+    """Largest gap of all other edges (running maxima), for each edge, by end of a link."""
     pairs, edges, others = build_features(scene).pairs, range(scene.polygon.n_vertices), {}
     for end, finger in product(("tip", "joint"), (0, 1)):
         values = [pairs[Contact("e", edge, end, finger)].gap for edge in edges]
-        before = list(accumulate(values[:-1], ca.fmax))
-        after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
-        inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
-        others[end, finger] = [after[0], *inner, before[-1]]
+        maxima_before = list(accumulate(values[:-1], ca.fmax))
+        maxima_after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
+        inner = [ca.fmax(*pair) for pair in zip(maxima_before[:-1], maxima_after[1:], strict=True)]
+        others[end, finger] = [maxima_after[0], *inner, maxima_before[-1]]
     return others
 
 
-def build_apart(scene: Scene, finger: int) -> Expression:
+def build_distance(scene: Scene, finger: int) -> Expression:
     """Return the signed distance between a link and the object [m]."""
     features, part = build_features(scene), scene.fingers[finger]
     link = features.links[finger]
@@ -229,8 +229,8 @@ def build_apart(scene: Scene, finger: int) -> Expression:
 def measure_gaps(scene: Scene, z: Array) -> Array:
     """Gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
 
-    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
-    the largest separation in any direction, independent of the pairs.
+    Object and palm, object and links 1 and 2, link and link (infinite if they do not collide): the
+    largest separation in any direction, independent of the elemental contacts.
     """
     return _build_gaps(scene)(z)[0][..., 0]
 
@@ -238,6 +238,6 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
 @stored(lambda scene: (scene.shape, scene.fingers_collide))
 def _build_gaps(scene: Scene) -> Batch:
     features = build_features(scene)
-    gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
+    gaps = [ca.mmin(features.vertices[1, :]), *(build_distance(scene, k) for k in range(2))]
     gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
     return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))

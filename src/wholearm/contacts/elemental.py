@@ -49,8 +49,8 @@ class Contact:
 
     feature: str  # {"v", "e"}: a vertex or an edge of the object
     index: int  # which vertex or edge
-    # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link; of what only
-    # stops a motion {"back", "joint"}: the far side of a link or the circle about its joint
+    # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link; as obstacles
+    # only {"back", "joint"}: the far side of a link or the circle about its joint
     surface: str
     finger: int | None = None  # 0 for finger 1, 1 for finger 2, None for the palm
 
@@ -69,8 +69,8 @@ class Contact:
         """The part of the hand, in words."""
         if self.finger is None:
             return "the palm"
-        where = {"tip": "the tip of ", "back": "the far side of ", "joint": "the joint of "}
-        return f"{where.get(self.surface, '')}finger {self.finger + 1}"
+        prefixes = {"tip": "the tip of ", "back": "the far side of ", "joint": "the joint of "}
+        return f"{prefixes.get(self.surface, '')}finger {self.finger + 1}"
 
     def __str__(self) -> str:
         return self.name
@@ -82,9 +82,9 @@ class ContactPair(NamedTuple):
     name: str
     gap: Expression  # [m]: the C-function, positive when apart
     slip: Expression  # [m]: its rate is the sliding velocity v_t while they touch
-    # [m]: all positive where the two face each other; the gap means nothing elsewhere
+    # [m]: all positive where the two features face each other; elsewhere the gap has no meaning
     ranges: tuple[Expression, ...] = ()
-    text: str = ""  # what has happened when the gap closes, in words
+    text: str = ""  # the event when the gap closes, in words
 
 
 class Link(NamedTuple):
@@ -99,7 +99,7 @@ class Link(NamedTuple):
 
 
 class Features(NamedTuple):
-    """Object and hand as expressions of z: what every contact is picked from."""
+    """Object and hand as expressions of z, with all pairs of features."""
 
     z: Expression  # (5,)
     vertices: Expression  # (2, n_v) [m]: world positions of the vertices
@@ -111,15 +111,15 @@ class GapLimit(NamedTuple):
     """A quantity that is positive while a contact formation is valid."""
 
     value: Expression  # [m]
-    text: str  # what has happened when it is zero
+    text: str  # the event when it is zero
     gained: Contact | None = None  # the contact that is gained there, if any
-    # others that may be gained there: a pointed tip at a vertex may go on along either edge, or
-    # along the link
-    also: tuple[Contact, ...] = ()
+    # other contacts that may be gained there: a pointed tip at a vertex may continue along either
+    # edge, or along the link
+    alternatives: tuple[Contact, ...] = ()
 
     def gains(self, contact: Contact | None) -> bool:
         """Whether a contact is gained there."""
-        return contact is not None and (contact == self.gained or contact in self.also)
+        return contact is not None and (contact == self.gained or contact in self.alternatives)
 
 
 def parse_contact(name: object, scene: Scene) -> Contact:
@@ -153,7 +153,7 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
 
 @stored(lambda scene: scene.shape)
 def build_features(scene: Scene) -> Features:
-    """The features of a scene as expressions of z, the same for scenes of one shape."""
+    """The features of a scene as expressions of z, shared by scenes of the same shape."""
     links = [(ca.DM(link.base), link.length, link.radius) for link in scene.fingers]
     return place_bodies(ca.DM(scene.polygon.vertices.T), links)
 
@@ -161,41 +161,41 @@ def build_features(scene: Scene) -> Features:
 def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -> Features:
     """Object and hand from corners, (2, n_v), and base, length and radius of each link [m]."""
     z, count = _Z, corners.shape[1]
-    run = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
-    lengths = ca.hypot(run[0, :], run[1, :])
+    along = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
+    lengths = ca.hypot(along[0, :], along[1, :])
     c, s = ca.cos(z[2]), ca.sin(z[2])
     rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
     vertices = rotation @ corners + ca.repmat(z[:2], 1, count)
     x, y = corners[0, :], corners[1, :]
-    along = run / ca.repmat(lengths, 2, 1)
+    units = along / ca.repmat(lengths, 2, 1)
     # Products with the vertices do not depend on the pose.
-    starts, depths = along[0, :] * x + along[1, :] * y, along[0, :] * y - along[1, :] * x
-    along = rotation @ along
-    normals = ca.vertcat(-along[1, :], along[0, :])
+    starts, depths = units[0, :] * x + units[1, :] * y, units[0, :] * y - units[1, :] * x
+    units = rotation @ units
+    normals = ca.vertcat(-units[1, :], units[0, :])
     # Gap, slip and ranges of each kind of pair, as rows over all vertices or edges.
-    parts, kinds = list[Link](), list[tuple[int | None, dict[str, tuple[Expression, ...]]]]()
+    bodies, kinds = list[Link](), list[tuple[int | None, dict[str, tuple[Expression, ...]]]]()
     kinds.append((None, {"v palm": (vertices[1, :], vertices[0, :])}))
     for finger, (base, length, radius) in enumerate(links):
         side, theta = 1.0 - 2 * finger, z[3 + finger]
         axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
         link = Link(base, base + length * axis, axis, side * rotate_quarter(axis), length, radius)
-        parts.append(link)
-        away = vertices - ca.repmat(base, 1, count)
-        run, level = axis.T @ away, link.normal.T @ away
-        inside = run, length - run
+        bodies.append(link)
+        r = vertices - ca.repmat(base, 1, count)
+        along, heights = axis.T @ r, link.normal.T @ r
+        ranges_on_link = along, length - along
         sides = {
-            "v finger": (level - radius, side * run, *inside),
-            "v back": (-level - radius, -side * run, *inside),
+            "v finger": (heights - radius, side * along, *ranges_on_link),
+            "v back": (-heights - radius, -side * along, *ranges_on_link),
         }
         kinds.append((finger, sides))
         for surface, centre, out in (("tip", link.tip, axis), ("joint", base, -axis)):
-            place, away = centre - z[:2], vertices - ca.repmat(centre, 1, count)
-            run, depth = place.T @ along - starts, place.T @ normals - depths
-            rest = lengths - run
-            edges = -depth - radius, -run - radius * (z[2] - theta), run, rest
-            ahead, turn = out.T @ away, ca.atan2(rotate_quarter(out).T @ away, out.T @ away)
-            before = -ca.horzcat(rest[-1], rest[:-1])
-            arcs = ca.sqrt(ca.sum1(away**2)) - radius, -radius * turn, ahead, before, -run
+            place, r = centre - z[:2], vertices - ca.repmat(centre, 1, count)
+            along, depth = place.T @ units - starts, place.T @ normals - depths
+            remaining = lengths - along
+            edges = -depth - radius, -along - radius * (z[2] - theta), along, remaining
+            axial, angle = out.T @ r, ca.atan2(rotate_quarter(out).T @ r, out.T @ r)
+            before_range = -ca.horzcat(remaining[-1], remaining[:-1])
+            arcs = ca.sqrt(ca.sum1(r**2)) - radius, -radius * angle, axial, before_range, -along
             kinds.append((finger, {f"e {surface}": edges, f"v {surface}": arcs}))
     pairs = {}
     for owner, rows in kinds:
@@ -206,7 +206,7 @@ def place_bodies(corners: Expression, links: Sequence[tuple[Expression, ...]]) -
                 contact = Contact(feature, k, surface, owner)
                 text = f"{contact.corner} touches {contact.part}"
                 pairs[contact] = ContactPair(contact.name, gap, slip, tuple(ranges), text)
-    return Features(z, vertices, tuple(parts), pairs)
+    return Features(z, vertices, tuple(bodies), pairs)
 
 
 def rotate_quarter(vector: Expression) -> Expression:

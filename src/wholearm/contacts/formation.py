@@ -29,10 +29,10 @@ class Kinematics(NamedTuple):
     A: Array  # A, A_t (n, n_c, 5):
     A_t: Array
     P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
-    P_dot_v: Array  # (n, n_c + R): P' v for the velocities v that were given: P z'' = -P' z'
+    P_dot_v: Array  # (n, n_c + R): P' v for velocities v: P z'' = -P' z'
 
     def pick(self, rows: Any) -> Kinematics:
-        """Those of some of the configurations."""
+        """The kinematics at some of the configurations."""
         return Kinematics(*(array[rows] for array in self))
 
 
@@ -60,7 +60,7 @@ class Formation:
 
     scene: Scene
     contacts: tuple[Contact, ...]  # in the order of every array over contacts
-    rolling: tuple[Contact, ...] = ()  # those of them that roll; the others slide
+    rolling: tuple[Contact, ...] = ()  # contacts that roll; the others slide
 
     def __post_init__(self) -> None:
         if not set(self.rolling) <= set(self.contacts):
@@ -86,17 +86,17 @@ class Formation:
         return len(self.contacts) + len(self.rolling)
 
     def add(self, contact: Contact | None) -> Formation:
-        """The formation with one more contact, which slides, if there is one."""
+        """The formation with one more (sliding) contact; the same formation if it is None."""
         return self if contact is None else replace(self, contacts=(*self.contacts, contact))
 
     @cached_property
     def rolling_rows(self) -> tuple[int, ...]:
-        """Which contacts roll, in the order of every array over rolling contacts."""
+        """Indices of the rolling contacts, in the order of every array over rolling contacts."""
         return tuple(self.contacts.index(c) for c in self.contacts if c in self.rolling)
 
     @cached_property
     def rubbing_rows(self) -> tuple[int, ...]:
-        """Which contacts slide with friction: those whose sliding direction matters."""
+        """Indices of the contacts that slide with friction, whose sliding direction matters."""
         return tuple(np.flatnonzero(self.sliding_friction).tolist())
 
     @property
@@ -105,11 +105,11 @@ class Formation:
         return tuple(contact.name for contact in self.contacts)
 
     def turn_with(self, row: int) -> tuple[int, ...]:
-        """Rows of (contacts, joints) that turn as one with a row: a flush edge's, or its own."""
-        sides = [(contact.surface, contact.finger) for contact in self.contacts]
-        if row >= len(sides) or sides[row][0] == "tip":
+        """Rows of (contacts, joints) that reverse with a row: both of a flush edge, or the row."""
+        surfaces = [(contact.surface, contact.finger) for contact in self.contacts]
+        if row >= len(surfaces) or surfaces[row][0] == "tip":
             return (row,)
-        return tuple(k for k, side in enumerate(sides) if side == sides[row])
+        return tuple(k for k, surface in enumerate(surfaces) if surface == surfaces[row])
 
     @cached_property
     def friction(self) -> Array:
@@ -125,12 +125,12 @@ class Formation:
 
     @property
     def equations(self) -> tuple[object, ...]:
-        """Equal for formations with the same equations of motion, whatever limits they have."""
+        """Key of the dynamics: equal for formations with the same equations of motion."""
         return (self.scene.equations, self.contacts, self.rolling)
 
     @property
     def function(self) -> Expression:
-        """CasADi function (z, v) -> (gaps and slips of what rolls [m], A, A_t, P' v)."""
+        """CasADi function (z, v) -> (gaps and slips of rolling contacts [m], A, A_t, P' v)."""
         return _build_function(self).function
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
@@ -142,7 +142,7 @@ class Formation:
     @property
     @stored(_identify_limits)
     def limits(self) -> tuple[GapLimit, ...]:
-        """Where this formation stops being valid, as expressions of the features' symbol z."""
+        """Gap limits at which the formation ceases to be valid, expressions of the symbol z."""
         return tuple(list_limits(self.scene, self.contacts))
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
@@ -166,13 +166,13 @@ class Formation:
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
     candidates, function = _build_clearances(scene)
-    near = np.abs(function(z[None])[0][0, :, 0]) < scene.touching
-    return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
+    flags = np.abs(function(z[None])[0][0, :, 0]) < scene.touching
+    return tuple(c for c, flag in zip(candidates, flags, strict=True) if flag)
 
 
 @stored(lambda scene: scene.shape)
 def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Batch]:
-    """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
+    """All contacts of a scene, and a function z -> their clearances [m]."""
     candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
     values = ca.vertcat(*(build_clearance(c, scene, False).value for c in candidates))
     function = ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
@@ -184,7 +184,7 @@ def describe(contacts: Sequence[Contact]) -> str:
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
 
 
-_V = ca.SX.sym("v", 5)  # of all scenes, as z is
+_V = ca.SX.sym("v", 5)  # shared by all scenes, as z is
 
 
 @stored(lambda contact, scene: (contact, scene.shape))
@@ -194,10 +194,10 @@ def _build_part(contact: Contact, scene: Scene) -> tuple[Expression, ...]:
     pair, z = features.pairs[contact], features.z
     A, A_t = (ca.jacobian(value, z) for value in (pair.gap, pair.slip))
     if contact.finger is not None and (contact.feature, contact.surface) == ("v", "tip"):
-        # The slip is that at the arc, A_t that of the vertex, wherever it is.
+        # The slip is that of a point on the arc, A_t that of the vertex at any gap.
         A_t *= 1 + pair.gap / scene.fingers[contact.finger].radius
-    bend, slip_bend = (ca.jtimes(rows @ _V, z, _V) for rows in (A, A_t))
-    return tuple(ca.cse([pair.gap, A, A_t, bend, pair.slip, slip_bend]))
+    A_dot_v, A_t_dot_v = (ca.jtimes(rows @ _V, z, _V) for rows in (A, A_t))
+    return tuple(ca.cse([pair.gap, A, A_t, A_dot_v, pair.slip, A_t_dot_v]))
 
 
 @stored(lambda formation: (formation.scene.shape, formation.contacts, formation.rolling))

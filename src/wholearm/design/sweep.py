@@ -1,7 +1,7 @@
 """Sweeps: a plan for each point of a grid, or of a Latin hypercube, of parameters of problems.
 
-A row depends on its point alone, not on the process that computes it nor on the order. Rows are
-kept one by one in a `Journal` and go through an executor, like samples of `analysis.robustness`.
+A row depends on its point alone, not on the process or the order. Rows are computed by an executor
+and stored one by one in a `Journal`, like samples of `analysis.robustness`.
 
 Parameters have the short names of `Problem.with_`, and the dotted key of any number in a problem
 file, such as ``phases[5].until.phi_deg``.
@@ -27,7 +27,7 @@ import numpy as np
 
 from .. import __version__
 from ..analysis.robustness import draw_cube
-from ..common.document import Document, Result, Table, format_csv, plain, show
+from ..common.document import Document, Result, Table, format_csv, show, to_plain
 from ..common.errors import (
     InfeasibleError,
     InputError,
@@ -53,15 +53,15 @@ _TABLES |= {f"fingers.{number}": FINGER for number in "12"}
 _FIELDS = {f"{part}.{key}": field for part, keys in _TABLES.items() for key, field in keys.items()}
 _SINGLE = ("epsilon", "gravity", "settle", "settle_gap", "control_period")
 _FIELDS |= {name: TOP[name] for name in _SINGLE}
-_SKIPPED = re.compile(r"\.flush$|\.guess\[|^uncertainty")  # whole numbers, and what moves no plan
+_SKIPPED = re.compile(r"\.flush$|\.guess\[|^uncertainty")  # integers, and numbers without effect
 
 
 class Parameter(NamedTuple):
-    """A number of a problem, or one that several keys share."""
+    """A number of a problem, or a common value of several keys."""
 
     name: str
     keys: tuple[str, ...]  # dotted keys of a problem file
-    value: float  # NaN where the problem leaves it out, or its keys differ
+    value: float  # NaN if the problem does not have it, or values of its keys differ
     unit: str
     scale: float = 1.0  # the scene's unit of such numbers
 
@@ -72,31 +72,31 @@ class Parameter(NamedTuple):
 
 
 def list_parameters(problem: Problem) -> list[Parameter]:
-    """Every number of a problem once, by its shortest name; none that it leaves out."""
-    chosen = dict[str, Parameter]()
-    for parameter in _find_every(problem).values():
+    """Every number that a problem has, once, by its shortest name."""
+    parameters = dict[str, Parameter]()
+    for parameter in _find_parameters(problem).values():
         key = parameter.keys[0]
-        left_out = not parameter.value and key in _FIELDS and _FIELDS[key].default == 0
-        if len(parameter.keys) == 1 and math.isfinite(parameter.value) and not left_out:
-            chosen.setdefault(key, parameter)
-    return [*chosen.values()]
+        is_default = not parameter.value and key in _FIELDS and _FIELDS[key].default == 0
+        if len(parameter.keys) == 1 and math.isfinite(parameter.value) and not is_default:
+            parameters.setdefault(key, parameter)
+    return [*parameters.values()]
 
 
 def find_parameter(problem: Problem, name: str, label: str = "") -> Parameter:
-    """The parameter that a name stands for; `label` is the option that it is from.
+    """The parameter with a name; `label` is the option that has the name.
 
-    InputError if the problem has none of this name; tells the nearest one.
+    InputError, with the most similar name, if the problem has none of this name.
     """
-    every = _find_every(problem)
-    if name in every:
-        return every[name]
-    shown = [p.name for p in list_parameters(problem) if not p.name.startswith("object.")]
-    text = f"is no number of a problem; {suggest(name, every)}those that this one gives are "
-    raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(shown))
+    parameters = _find_parameters(problem)
+    if name in parameters:
+        return parameters[name]
+    names = [p.name for p in list_parameters(problem) if not p.name.startswith("object.")]
+    text = f"is no number of a problem; {suggest(name, parameters)}those that this one gives are "
+    raise InputError(problem.source, f"{label} {name}".strip(), text + ", ".join(names))
 
 
 def require_allowed(problem: Problem, name: str, value: Any, label: str) -> None:
-    """Raise an `InputError` if no file may have a value; what cannot be reached with it may be."""
+    """InputError if no file may have a value; values without a reachable end are allowed."""
     try:
         problem.with_({name: value})
     except InputError as error:
@@ -105,22 +105,22 @@ def require_allowed(problem: Problem, name: str, value: Any, label: str) -> None
             raise InputError(problem.source, f"{label} {name}", error.problem) from None
 
 
-def _find_every(problem: Problem) -> dict[str, Parameter]:
+def _find_parameters(problem: Problem) -> dict[str, Parameter]:
     """All parameters by their names, short ones first."""
     scene, scales = problem.scene, problem.scene.scales
     numbers = dict(_list_numbers(describe_scene(scene) | {"object.inertia": scene.polygon.inertia}))
     numbers |= dict(_list_numbers(problem.table))
-    every = dict[str, Parameter]()
-    short = {name: keys for name, keys in name_keys().items() if _find_field(keys[0])}
-    for name, keys in (short | {key: (key,) for key in numbers}).items():
+    parameters = dict[str, Parameter]()
+    short_names = {name: keys for name, keys in name_keys().items() if _find_field(keys[0])}
+    for name, keys in (short_names | {key: (key,) for key in numbers}).items():
         field, values = _find_field(keys[0]), {numbers.get(key, math.nan) for key in keys}
-        whole = field is None or (field.kind in (POINT, CORNERS) and "[" not in keys[0])
-        if _SKIPPED.search(keys[0]) or (whole and keys[0] not in numbers):
+        is_table = field is None or (field.kind in (POINT, CORNERS) and "[" not in keys[0])
+        if _SKIPPED.search(keys[0]) or (is_table and keys[0] not in numbers):
             continue
         unit = (field.unit, getattr(scales, field.scale or "_", 1.0)) if field else ("", 1.0)
         value = values.pop() if len(values) == 1 else math.nan
-        every[name] = Parameter(name, keys, value, *unit)
-    return every
+        parameters[name] = Parameter(name, keys, value, *unit)
+    return parameters
 
 
 def _find_field(key: str) -> Field | None:
@@ -142,10 +142,10 @@ def _list_numbers(value: Any, key: str = "") -> Iterator[tuple[str, float]]:
 
 
 Point = tuple[Any, ...]  # index of a problem, and the value of each parameter
-Row = dict[str, Any]  # what came of a point, as plain values; see `Sweep`
+Row = dict[str, Any]  # results of a point, as plain values; see `Sweep`
 CHECKS = ("verify", "free", "policy")
-"""What plans can be tried with: the replay with given contacts, without, and as a policy."""
-ACTIVE = 1e-3  # slack below which a limit counts as active, over the unit of its shortfalls
+"""Simulations of plans: with prescribed contacts, without, and with a policy."""
+ACTIVE = 1e-3  # largest slack of an active limit, over the unit of its shortfalls
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Planner:
     checks: tuple[str, ...] = ()  # of `CHECKS`
 
     def run(self, task: tuple[int, Point]) -> Row:
-        """The row of a point, which has a number."""
+        """The row of a numbered point."""
         index, *values = task[1]
         changes = dict(zip(self.names, values, strict=True))
         try:
@@ -174,14 +174,14 @@ class Planner:
 
 
 def find_limit(plan: Plan) -> tuple[str, float]:
-    """The limit that is active for the longest time, and for which share of the motion.
+    """The limit that is active for the longest time, and its fraction of the duration.
 
-    Instead of epsilon counts the plan's least normal force, which is more for the objective margin.
+    The bound on normal forces is the least one of the plan, as the objective margin raises it.
     """
     motion = plan.trajectory
     least, contact = min(motion.least_forces)
-    # That force may be least for an instant between samples.
-    spent = {f"c_n of {contact}": 0.0}
+    # The least force may be that of an instant between samples.
+    times = {f"c_n of {contact}": 0.0}
     weight = (np.diff(motion.t, prepend=0.0) + np.diff(motion.t, append=motion.t[-1])) / 2
     for phase in plan.problem.phases:
         rows, formation = motion.phase == phase.index, phase.formation
@@ -190,21 +190,21 @@ def find_limit(plan: Plan) -> tuple[str, float]:
         c_t = motion.c_t[rows][:, columns][:, formation.rolling_rows]
         forces = [motion.c_n[rows][:, columns], c_t, motion.tau[rows], motion.theta_dot[rows]]
         slack, sides = limits.find_slack(np.hstack(forces) @ limits.rows.T), limits.sides[0]
-        times = weight[rows] @ (slack <= ACTIVE * limits.scales[sides])
-        for owner, length in zip(limits.owners[sides], times.tolist(), strict=True):
+        active_times = weight[rows] @ (slack <= ACTIVE * limits.scales[sides])
+        for owner, duration in zip(limits.owners[sides], active_times.tolist(), strict=True):
             name = name_limit(limits.limits[owner].text)
-            spent[name] = spent.get(name, 0.0) + length
-    limit = max(spent, key=lambda name: spent[name])
-    return limit, spent[limit] / motion.duration
+            times[name] = times.get(name, 0.0) + duration
+    limit = max(times, key=lambda name: times[name])
+    return limit, times[limit] / motion.duration
 
 
 def name_limit(limit: str) -> str:
-    """A limit in words, without its value."""
+    """Name of a limit, without its value."""
     return re.split(r" >?= |, ", limit, maxsplit=1)[0]
 
 
 def _try(plan: Plan, check: str) -> str:
-    """What a check of a plan finds; "ok" if it holds."""
+    """Result of a check of a plan: "ok", or the failure."""
     from ..policy.make import make_policy
     from ..verification.free import verify_free, verify_policy
     from ..verification.verify import verify
@@ -242,10 +242,10 @@ class Sweep(Result):
 
     A row has `problem`, the parameters by name, and `status`. With a plan: the `value` of the
     objective; `margin`, the least normal force beyond epsilon [N]; the `limit` that is active for
-    the longest time, and its `share` of the motion; `duration1`, ... of the phases [s]; for each
-    check "ok" or what fails. Without one: its `reason` in a few words, alike for neighbouring
-    points; the smallest `change` of one number with which there is a plan, if one was found; the
-    whole `message`.
+    the longest time, and its `share` of the duration; `duration1`, ... of the phases [s]; for each
+    check "ok" or the failure. Without one: its `reason` in a few words, equal for similar points;
+    the smallest `change` of one number with which there is a plan, if one was found; the whole
+    `message`.
     """
 
     derived = ("reasons", "best")
@@ -269,7 +269,7 @@ class Sweep(Result):
 
     @property
     def reasons(self) -> dict[str, int]:
-        """How many points have no plan for each reason, the most frequent first."""
+        """Numbers of points without a plan, by reason, the most frequent first."""
         return dict(Counter(r["reason"] for r in self.rows if "reason" in r).most_common())
 
     @property
@@ -281,7 +281,7 @@ class Sweep(Result):
 
     @property
     def document(self) -> Document:
-        """All rows, how many have no plan for which reason, and the best one."""
+        """All rows, reasons of missing plans with counts, and the best row."""
         names = {"problem": "problem"} if len(self.problems) > 1 else {}
         names |= {name: f"{title}:.6g" for name, title in self.titles.items()}
         columns = names | {"status": "status", "value": f"{self.label}:.6g"}
@@ -294,14 +294,14 @@ class Sweep(Result):
             if "limit" in row:
                 cells["reason"] = f"{row['limit']} ({100 * row['share']:.0f} % of the time)"
             rows.append([(row | cells).get(key) for key in columns])
-        last = f"no point has a plan, most often because of: {next(iter(reasons), '')}"
+        summary = f"no point has a plan, most often because of: {next(iter(reasons), '')}"
         if best is not None:
             place = [f"{name} = {show(self.rows[best][name], '.6g')}" for name in names]
-            last = ", ".join([f"best: {self.label} = {self.rows[best]['value']:.6g}", *place])
-        table = Table([*columns.values()], rows, most=100)
+            summary = ", ".join([f"best: {self.label} = {self.rows[best]['value']:.6g}", *place])
+        table = Table([*columns.values()], rows, max_rows=100)
         causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
         reason = f"{len(rows) - sum(reasons.values())} of {len(rows)} points planned"
-        return Document(", ".join(self.problems), reason=reason, parts=[table, causes, last])
+        return Document(", ".join(self.problems), reason=reason, parts=[table, causes, summary])
 
     def to_csv(self) -> str:
         """All rows as CSV, with all digits."""
@@ -310,7 +310,7 @@ class Sweep(Result):
 
 
 def require_table(path: str) -> None:
-    """Raise an `InputError` if a file is there that is no table of a sweep, and not empty."""
+    """InputError if a file exists, is not empty, and is no table of a sweep."""
     if os.path.isfile(path):
         with name_file(path), open(path, "rb") as stream:
             head = stream.readline()
@@ -331,15 +331,15 @@ def read_vary(
     vary = dict[str, tuple[Any, ...]]()
     form = "NAME=LOW:HIGH" if samples else "NAME=LOW:HIGH:COUNT or NAME=VALUE,VALUE"
     for text in texts:
-        name, _, given = text.partition("=")
-        parts: list[Any] = [_parse(part) for part in re.split("[:,]", given)]
-        several = ":" not in given and not samples
-        if several and name and given and name not in vary:
+        name, _, values = text.partition("=")
+        parts: list[Any] = [_parse(part) for part in re.split("[:,]", values)]
+        is_list = ":" not in values and not samples
+        if is_list and name and values and name not in vary:
             vary[name] = tuple(parts)
             continue
         numbers = all(isinstance(part, Real) and math.isfinite(part) for part in parts)
-        wrong = several or "," in given or name in vary or len(parts) != 3 - bool(samples)
-        if wrong or not numbers or parts[0] >= parts[1]:
+        malformed = is_list or "," in values or name in vary or len(parts) != 3 - bool(samples)
+        if malformed or not numbers or parts[0] >= parts[1]:
             text = f"{text!r} given; {form} is needed, LOW below HIGH and each name once"
             raise InputError("", option, text)
         count = Range(2, 10**6).read((*parts, 2)[2], f"{option} {name}: COUNT")
@@ -369,7 +369,7 @@ def sweep(
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Sweep:
-    """Plan problems with other values of parameters.
+    """Plan problems for many values of parameters.
 
     Parameters
     ----------
@@ -379,12 +379,12 @@ def sweep(
     samples          size of a Latin hypercube, from the first to the last of the values, in place
                      of the grid; 0 for the grid
     seed             of the samples
-    checks           of "verify", "free" and "policy": what plans are tried with besides the replay
-                     that is part of planning
+    checks           of "verify", "free" and "policy": simulations of plans besides the replay that
+                     is part of planning
     time_limit : [s] for planning one point
-    path, fresh      file to which rows are written as they come, and whether it is begun anew
-    start            what makes processes; these three as of `assess_robustness`
-    progress         told how many points are done, and the time that is left
+    path, fresh      file to which rows are written one by one, and whether it is overwritten
+    start            makes an executor; these three as of `assess_robustness`
+    progress         called with a text on finished points and the remaining time
     **options        as `wholearm.solve` takes them
 
     InputError if a problem lacks a parameter, no file may have one of its values, or the file holds
@@ -395,11 +395,11 @@ def sweep(
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
     goal = PlanOptions(**chosen).goal
-    axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
+    axes = {name: tuple(to_plain(list(values))) for name, values in vary.items()}
     titles = dict[str, str]()
-    for problem, (name, given) in product(listed[::-1], vary.items()):
-        numbers = all(isinstance(value, Real) and math.isfinite(value) for value in given)
-        for value in (min(given), max(given)) if numbers else given:
+    for problem, (name, candidates) in product(listed[::-1], vary.items()):
+        numbers = all(isinstance(value, Real) and math.isfinite(value) for value in candidates)
+        for value in (min(candidates), max(candidates)) if numbers else candidates:
             require_allowed(problem, name, value, "--vary")
         titles[name] = name
         with suppress(InputError):
@@ -418,27 +418,27 @@ def sweep(
     stamp = {
         "study": "sweep", "version": __version__, "problems": [p.table for p in listed],
         "vary": axes, "samples": samples, "seed": seed,
-        "options": plain(planner.options), "checks": checks,
+        "options": to_plain(planner.options), "checks": checks,
     }  # fmt: skip
     with Journal(os.fspath(path or os.devnull), stamp, fresh) as journal:
         rows = {record["point"]: record["row"] for record in journal.records}
         tasks = [(k, point) for k, point in enumerate(points) if k not in rows]
-        began, before = time.monotonic(), len(rows)
+        began, n_stored = time.monotonic(), len(rows)
         for (number, _), answer in run_all(planner.run, tasks, (start or Processes)()):
             if isinstance(answer, Exception):
-                # Not kept: what a process died of may not be there the next time.
+                # Not stored: the next run may succeed where a process died.
                 rows[number] = describe_failure(answer)
             else:
                 rows[number] = answer
                 journal.add({"point": number, "row": answer})
             if progress is not None:
                 done, count = len(rows), len(points)
-                left = (time.monotonic() - began) / max(done - before, 1) * (count - done)
-                time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
+                seconds = (time.monotonic() - began) / max(done - n_stored, 1) * (count - done)
+                time_left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
                 bar = f"[{'#' * (20 * done // count):.<20}]"
                 progress(f"{bar} {done} of {count} points, {time_left} left")
-    whole = (
+    all_rows = (
         {"problem": names[index], **dict(zip(axes, values, strict=True)), **rows[k]}
         for k, (index, *values) in enumerate(points)
     )
-    return Sweep(tuple(names), goal, axes, samples, tuple(whole), titles, tuple(checks))
+    return Sweep(tuple(names), goal, axes, samples, tuple(all_rows), titles, tuple(checks))

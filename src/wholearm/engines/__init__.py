@@ -1,1 +1,1 @@
-"""Plans in physics engines that are told nothing of contacts: MuJoCo, Drake, and MJCF files."""
+"""Plans in physics engines, without prescribed contacts: MuJoCo, Drake, and MJCF files."""

@@ -22,16 +22,16 @@ from ..problem.definition import Problem
 from ..scene.model import Scene
 from . import engine_replay as engine
 
-_EVERY = 4  # steps from one look at the forces to the next: contacts swing ten times as slowly
+_STRIDE = 4  # steps between two readings of forces: oscillations of contacts last ten times as long
 
 
 def play(
     problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
 ) -> engine.EngineRun:
-    """Replay a stretch in Drake; an `Engine`."""
-    steps = engine.list_steps(problem, stretch, torque, setting.step, _EVERY)
+    """Simulate a stretch in Drake; an `Engine`."""
+    steps = engine.list_steps(problem, stretch, torque, setting.step, _STRIDE)
     drive, setting = steps.drive, setting._replace(step=steps.h / problem.scene.scales.time)
-    # Half spaces touch nothing deformable, which would be a warning.
+    # Drake warns of half spaces, which cannot touch deformable bodies.
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -41,14 +41,14 @@ def play(
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     pairs = engine.list_pairs(problem.scene)
     stiffness = dict.fromkeys((p.name for p in pairs), _find_stiffness(problem.scene, setting))
-    plant.SetPositions(context, engine.press_in(problem, stretch, stiffness))
+    plant.SetPositions(context, engine.penetrate_start(problem, stretch, stiffness))
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results, motors = plant.get_contact_results_output_port(), plant.get_actuation_input_port()
 
     def advance(start: int, end: int) -> Array:
-        total, looks = np.zeros(len(pairs)), range(end, start, -_EVERY)[::-1]
-        for begin, stop in pairwise([start, *looks]):
+        total, readings = np.zeros(len(pairs)), range(end, start, -_STRIDE)[::-1]
+        for begin, stop in pairwise([start, *readings]):
             torques = steps.tau[begin:stop]
             if drive is not None:
                 z, v = plant.GetPositions(context), plant.GetVelocities(context)
@@ -56,15 +56,15 @@ def play(
                 torques = np.tile(tau, (stop - begin, 1))
             for step, tau in enumerate(torques, begin):
                 motors.FixValue(context, tau)
-                # Half a step late: the step at that time is done then, whatever its rounding.
+                # Half a step more: the step at that time is complete then, in spite of rounding.
                 simulator.AdvanceTo((step + 0.5) * steps.h)
             contact_results = results.Eval(context)
             for k in range(contact_results.num_point_pair_contacts()):
                 info = contact_results.point_pair_contact_info(k)
-                both = info.point_pair()
-                number = numbers[frozenset((both.id_A, both.id_B))]
-                total[number] += abs(info.contact_force() @ both.nhat_BA_W)
-        return total / len(looks)
+                point_pair = info.point_pair()
+                number = numbers[frozenset((point_pair.id_A, point_pair.id_B))]
+                total[number] += abs(info.contact_force() @ point_pair.nhat_BA_W)
+        return total / len(readings)
 
     def read() -> tuple[Array, Array]:
         return plant.GetPositions(context), plant.GetVelocities(context)
@@ -76,7 +76,7 @@ def _build(scene: Scene, h: float, setting: engine.Setting) -> tuple[Any, Any, d
     """Diagram, plant with steps of h [s], and numbers of pairs by identities of their shapes."""
     builder = DiagramBuilder()
     plant, graph = multibody.AddMultibodyPlantSceneGraph(builder, h)
-    # The default approximation, lagged, is wrong by millimetres here; TAMSI converges.
+    # The default approximation, lagged, has errors of millimetres; TAMSI converges.
     plant.set_discrete_contact_approximation(multibody.DiscreteContactApproximation.kTamsi)
     plant.set_contact_model(multibody.ContactModel.kPoint)
     _add_bodies(plant, scene)
@@ -87,7 +87,7 @@ def _build(scene: Scene, h: float, setting: engine.Setting) -> tuple[Any, Any, d
 
 
 def _add_bodies(plant: Any, scene: Scene) -> None:
-    """Object and links, whose weight is no part of the model, on their joints."""
+    """Object and links, without weight of the links, on their joints."""
 
     def add(name: str, mass: float, inertia: float) -> Any:
         unit = tree.UnitInertia(*3 * [inertia / mass])
@@ -102,13 +102,13 @@ def _add_bodies(plant: Any, scene: Scene) -> None:
         place = RigidTransform([*np.asarray(link.base), 0.0])
         base = plant.AddFrame(tree.FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
         frames = base, link_body.body_frame()
-        turn = tree.RevoluteJoint(name, *frames, [0.0, 0.0, 1.0], link.viscous)
-        plant.AddJointActuator(name, plant.AddJoint(turn))
+        joint = tree.RevoluteJoint(name, *frames, [0.0, 0.0, 1.0], link.viscous)
+        plant.AddJointActuator(name, plant.AddJoint(joint))
     plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
 
 
 def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -> dict[Any, int]:
-    """Add balls, capsules and the palm; only pairs that may touch are looked at."""
+    """Add balls, capsules and the palm; numbers of the pairs that may touch, by their shapes."""
     shapes = {shape.name: shape for shape in engine.list_shapes(scene)}
     geometry_ids: dict[tuple[str, float], Any] = {}
 
@@ -137,12 +137,12 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -
     numbers = {}
     for number, pair in enumerate(engine.list_pairs(scene)):
         # Drake combines two frictions as 2 a b / (a + b), which is 2 b for a large a.
-        one, two = (1e12, pair.friction / 2) if pair.friction else (0.0, 0.0)
-        ids = [register(pair.first, one), register(pair.second, two)]
+        friction1, friction2 = (1e12, pair.friction / 2) if pair.friction else (0.0, 0.0)
+        ids = [register(pair.first, friction1), register(pair.second, friction2)]
         numbers[frozenset(ids)] = number
     manager = graph.collision_filter_manager()
-    every = geometry.GeometrySet(list(geometry_ids.values()))
-    manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(every))
+    all_shapes = geometry.GeometrySet(list(geometry_ids.values()))
+    manager.Apply(geometry.CollisionFilterDeclaration().ExcludeWithin(all_shapes))
     allowed = geometry.CollisionFilterDeclaration()
     for first, second in numbers:
         allowed.AllowBetween(geometry.GeometrySet(first), geometry.GeometrySet(second))
@@ -151,16 +151,16 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: engine.Setting) -
 
 
 def _find_stiffness(scene: Scene, setting: engine.Setting) -> float:
-    """That of a pair, which sinks in by 6e-3 lengths under the scene's force [N/m]."""
+    """Stiffness of a pair: penetration of 6e-3 lengths under the scene's force [N/m]."""
     return scene.scales.force / (6e-3 * setting.step * setting.softness * scene.scales.length)
 
 
 def _place(shape: engine.Shape) -> tuple[Any, Any]:
-    """A ball or a capsule, and where it is on its body."""
+    """Pose of a ball or a capsule on its body, and its geometry."""
     middle = [*shape.points.mean(axis=0), 0.0]
     if len(shape.points) == 1:
         return RigidTransform(middle), geometry.Sphere(shape.radius)
-    run = shape.points[1] - shape.points[0]
-    length = float(np.hypot(*run))
-    turn = RotationMatrix.MakeFromOneVector([*(run / length), 0.0], 2)
-    return RigidTransform(turn, middle), geometry.Capsule(shape.radius, length)
+    axis = shape.points[1] - shape.points[0]
+    length = float(np.hypot(*axis))
+    rotation = RotationMatrix.MakeFromOneVector([*(axis / length), 0.0], 2)
+    return RigidTransform(rotation, middle), geometry.Capsule(shape.radius, length)

@@ -1,7 +1,7 @@
 """Replays of plans, and simulations of policies, in physics engines, compared with the plan.
 
-Engines know no points and no lines, only balls and capsules. Those of the object get the radius r
-(`find_rounding`), and what they touch is that much thinner, so that gaps are the C-functions:
+The shapes of engines are balls and capsules. Vertices and edges of the object get the radius r
+(`find_rounding`), and shapes that they touch are thinner by r, so that gaps are the C-functions:
 
 ============  ==========================  ===================  =====================================
 shape         of                          radius               touches
@@ -14,8 +14,8 @@ shape         of                          radius               touches
 ``palm``      the half plane y <= -r                           vertices
 ============  ==========================  ===================  =====================================
 
-Pairs have the friction of palm or finger. A tip that passes a vertex touches that and the ends of
-both edges at one place. The links press each other without friction.
+Pairs have the friction of palm or finger. A tip at a vertex touches the vertex and the ends of both
+edges at one place. Contacts between links are frictionless.
 
 The cause of a departure is the first deviation in contacts that lasts until the error of the pose
 exceeds its limit: a contact opens, sticks, slips, or one that is not planned has force.
@@ -35,15 +35,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Flags, Independent, Numbers, find_runs, sort_unique
+from ..common.arrays import Array, Flags, IndependentRows, Numbers, find_runs, sort_unique
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, WholearmError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
-from ..problem.read import read_own_problem
-from ..results.adopt import Moved, adopt_motion
+from ..problem.read import read_stored_problem
+from ..results.adopt import MotionLike, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Samples, Trajectory
 from ..scene.model import Scene
@@ -67,7 +67,7 @@ class Shape(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two shapes, or a shape and the palm, that may touch; it has the name of their contact."""
+    """Two shapes, or a shape and the palm, that may touch."""
 
     first: str
     second: str
@@ -75,19 +75,19 @@ class Pair(NamedTuple):
 
     @property
     def name(self) -> str:
-        """First and second, as contacts are named."""
+        """Names of both, in the form of names of contacts."""
         return f"{self.first}-{self.second}"
 
 
 def find_rounding(scene: Scene) -> float:
-    """Radius of vertices and edges [m]; the palm is that much lower."""
+    """Radius of vertices and edges, and depth of the palm below y = 0 [m]."""
     return 1e-7 * scene.scales.length
 
 
 def list_shapes(scene: Scene) -> list[Shape]:
     """Every shape of object and links.
 
-    InputError if a link has no thickness: what sinks into it would come out on the other side.
+    InputError if a link has no thickness: penetrating bodies would leave it on the other side.
     """
     r, corners = find_rounding(scene), scene.polygon.vertices
     edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -127,9 +127,9 @@ def find_pairs(contact: str, corners: int) -> tuple[str, ...]:
     return (f"{corner}-finger{finger}", *edges)
 
 
-SAME = 1e-4  # difference of replay and plan that counts as none, over the scene's length and in rad
+TOLERANCE = 1e-4  # of the replay in its own problem, over the scene's length and in rad
 ROWS = 200  # approximate rows of a result per phase
-_LOOKS = 8  # samples of each step over which torques are averaged
+_SAMPLES = 8  # samples of torques of each step for their mean
 
 
 class EngineStretch(NamedTuple):
@@ -163,14 +163,14 @@ class Setting(NamedTuple):
     """Discretization of an engine."""
 
     step: float = 1.6e-4  # time step, over the scene's time: 1e-5 s in the scenes of `problems/`
-    softness: float = 1.0  # of contacts, over the engine's default, which is in proportion to step
+    softness: float = 1.0  # of contacts, over the engine's default, which is proportional to step
 
 
 class Steps(NamedTuple):
     """Time steps of a stretch.
 
-    Engines use the semi-implicit Euler method, which is of second order in h if velocities are read
-    as those of half a step before: at the start, and for the torques.
+    Engines use the semi-implicit Euler method, which is of second order in h if velocities are
+    those half a step before positions: at the start, and for the torques.
     """
 
     h: float  # [s]
@@ -202,21 +202,21 @@ class EngineRun(NamedTuple):
         return rows[: int(np.argmax(np.append(forces.any(axis=1), True)))]
 
 
-Drive = TorqueProfile | ClosedLoop  # torques that are applied, or by feedback
+Drive = TorqueProfile | ClosedLoop  # torques in open loop, or by feedback
 Engine = Callable[[Problem, EngineStretch, Drive, Setting], EngineRun]
-"""Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
+"""Simulates a stretch under torques, or by feedback until the motion is over."""
 
 
-def list_stretches(plan: Trajectory, begins: Sequence[int]) -> list[EngineStretch]:
-    """Parts of a plan, from its planned start at each of the phases `begins` to the next one."""
+def list_stretches(plan: Trajectory, firsts: Sequence[int]) -> list[EngineStretch]:
+    """Parts of a plan, each from the planned start of a phase in `firsts` to the next one."""
     starts, stretches = plan.phase_starts, []
-    for first, after in pairwise([*begins, len(plan.motions)]):
-        motion, start, stop = plan.motions[first], starts[first], starts[after]
+    for begin, after in pairwise([*firsts, len(plan.motions)]):
+        motion, start, stop = plan.motions[begin], starts[begin], starts[after]
         at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
-        # Forces of a replay that waits at rest are NaN.
+        # Forces of a replay are NaN while it dwells at rest.
         c_n = np.nan_to_num(at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))])
         forces = dict(zip(motion.contacts, c_n.tolist(), strict=True))
-        span = tuple(range(first, after)), float(start), float(stop)
+        span = tuple(range(begin, after)), float(start), float(stop)
         stretches.append(EngineStretch(*span, at.z[0], at.z_dot[0], at.z_ddot[0], forces))
     return stretches
 
@@ -226,19 +226,19 @@ def list_steps(
 ) -> Steps:
     """Even steps that fit a stretch, none longer than `step` times the scene's time.
 
-    Feedback is asked `every` so many steps.
+    Feedback is evaluated once in `every` steps.
     """
     duration = stretch.stop - stretch.start
-    # Contacts oscillate after a jump of torques: that takes some steps.
+    # Oscillations of contacts after a jump of torques need many steps.
     count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), 5000)
     h = duration / count
     tau, drive = np.zeros((count, 2)), None
     if isinstance(torque, ClosedLoop):
         drive = EngineDrive(problem.scene, torque, duration, every * h)
     else:
-        t = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
+        t = (np.arange(count * _SAMPLES) + 0.5) * (h / _SAMPLES) - h / 2
         samples = torque.at(stretch.start + np.maximum(t, 1e-3 * h))
-        tau = np.asarray(samples.reshape(count, _LOOKS, 2).mean(axis=1))
+        tau = np.asarray(samples.reshape(count, _SAMPLES, 2).mean(axis=1))
     v = stretch.z_dot - h / 2 * stretch.z_ddot
     rows = min(count, ROWS * len(stretch.phases))
     ends = np.linspace(0, count, rows + 1)[1:].astype(int).tolist()
@@ -254,113 +254,113 @@ def record(
 ) -> EngineRun:
     """Run an engine to the end of its steps, or until its policy is over.
 
-    `advance` takes the steps from one number to another, and returns the mean forces of the pairs
-    [N]; `read` returns z and z_dot, (5,) each.
+    `advance` simulates from one step to another, and returns the mean forces of the pairs [N];
+    `read` returns z and z_dot, (5,) each.
     """
-    states, press, start = [(stretch.z, stretch.z_dot)], [], 0
+    states, forces, start = [(stretch.z, stretch.z_dot)], [], 0
     for end in steps.ends:
-        press.append(advance(start, end))
+        forces.append(advance(start, end))
         states.append(read())
         start = end
         if steps.drive is not None and steps.drive.loop.over:
             break
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
-    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
-    return EngineRun(t, z, z_dot, tuple(pair.name for pair in pairs), np.array(press))
+    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(forces)]])
+    return EngineRun(t, z, z_dot, tuple(pair.name for pair in pairs), np.array(forces))
 
 
 def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
-    """The torques of a plan less D sgn(theta') of its own joint velocities, with its steps."""
+    """The torques of a plan less the dry friction D sgn(theta') of its joint velocities."""
     torque, reversals = plan.torque, list[Array]()
     for start, motion in zip(plan.phase_starts[:-1], plan.motions, strict=True):
         t = np.linspace(0.0, motion.duration, 2000)
-        for speed in motion.evaluate(t).z_dot[:, 3:].T:
-            back = np.flatnonzero(speed[1:-2] * speed[2:-1] < 0) + 1
-            share = speed[back] / (speed[back] - speed[back + 1])
-            reversals.append(start + t[back] + share * (t[back + 1] - t[back]))
-    cuts = sort_unique(np.concatenate([torque.breaks, *reversals]))
-    cuts = cuts[np.append(True, np.diff(cuts) > 1e-12 * torque.duration)]
-    cuts[-1] = torque.breaks[-1]
-    turns = np.sign(plan.at((cuts[1:] + cuts[:-1]) / 2).z_dot[:, 3:]) * scene.dry[3:]
+        for rates in motion.evaluate(t).z_dot[:, 3:].T:
+            rows = np.flatnonzero(rates[1:-2] * rates[2:-1] < 0) + 1
+            fraction = rates[rows] / (rates[rows] - rates[rows + 1])
+            reversals.append(start + t[rows] + fraction * (t[rows + 1] - t[rows]))
+    breaks = sort_unique(np.concatenate([torque.breaks, *reversals]))
+    breaks = breaks[np.append(True, np.diff(breaks) > 1e-12 * torque.duration)]
+    breaks[-1] = torque.breaks[-1]
+    friction = np.sign(plan.at((breaks[1:] + breaks[:-1]) / 2).z_dot[:, 3:]) * scene.dry[3:]
 
     def evaluate(t: Array) -> Array:
-        piece = np.searchsorted(cuts, t, side="right") - 1
-        return np.asarray(torque.at(t) - turns[piece])
+        piece = np.searchsorted(breaks, t, side="right") - 1
+        return np.asarray(torque.at(t) - friction[piece])
 
-    return TorqueProfile.fit(cuts, evaluate, torque.coefficients.shape[2] - 1)
+    return TorqueProfile.fit(breaks, evaluate, torque.coefficients.shape[2] - 1)
 
 
-def find_between(plan: Trajectory) -> Trajectory:
-    """The replay of a plan in its own problem, or the plan itself where that is not the same."""
+def find_reference(plan: Trajectory) -> Trajectory:
+    """The replay of a plan in its own problem, or the plan if the replay differs from it."""
     starts = plan.phase_starts
     times = np.linspace(starts[:-1], starts[1:], 400)
     try:
-        problem = read_own_problem(plan.meta)
+        problem = read_stored_problem(plan.meta)
         replay = simulate(problem, plan.torque, times=times.ravel()).trajectory
     except WholearmError:
         return plan
     if len(replay.motions) != len(plan.motions):
         return plan
-    late = np.abs(replay.phase_starts - starts).max()
-    inside = np.clip(plan.t, 0.0, replay.duration)
-    error = np.abs(replay.at(inside).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
+    delay = np.abs(replay.phase_starts - starts).max()
+    times = np.clip(plan.t, 0.0, replay.duration)
+    error = np.abs(replay.at(times).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
     # Rest is approached slowly: ends of phases may differ more.
-    same = late < 1e-3 * problem.scene.scales.time and error.max() < SAME
-    return replay if same else plan
+    agrees = delay < 1e-3 * problem.scene.scales.time and error.max() < TOLERANCE
+    return replay if agrees else plan
 
 
-def press_in(
+def penetrate_start(
     problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float] | None = None
 ) -> Array:
     """The planned start with penetrations of planned force over stiffness, shape (5,).
 
     It is the nearest such configuration in the metric of the kinetic energy. Contacts without a
-    force, such as released ones, get a small gap: oscillations at the start would hit them.
+    force, such as released ones, get a small gap, as oscillations at the start would hit them.
 
-    `stiffness` is that of each pair of shapes [N/m]; without it all sink in a little.
+    `stiffness` is that of each pair of shapes [N/m]; without it all penetrations are small.
     """
     scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
     touching = find_touching(scene, stretch.z)
     contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
     A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     weight = 1 / np.sqrt(scene.mass_diagonal)
-    # Of others what is independent: contacts at one place share all of their rows but rounding.
-    independent, count = Independent(0.1), formation.n_contacts
+    # Other contacts only if independent: rows of contacts at one place are equal but for rounding.
+    independent, count = IndependentRows(0.1), formation.n_contacts
     rows = [k for k, row in enumerate(A * weight) if independent.add(row) or k < count]
     depth = scene.scales.length * np.where(np.arange(len(contacts)) < count, 1e-6, -3e-7)
     if stiffness is not None:
         for k, name in enumerate(formation.names):
-            stiff = sum(stiffness[pair] for pair in find_pairs(name, scene.polygon.n_vertices))
-            depth[k] = stretch.c_n[name] / stiff if stiff else 0.0
+            total = sum(stiffness[pair] for pair in find_pairs(name, scene.polygon.n_vertices))
+            depth[k] = stretch.c_n[name] / total if total else 0.0
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
 
 
 class EngineDrive:
-    """Torques of a policy in an engine, sampled, delayed, and less regularized dry friction.
+    """Torques of a policy in an engine, with sampling, delay and regularized dry friction.
 
-    It lasts for a `duration`, and two calls are `h` apart [s].
+    It lasts for a `duration`, and calls have the distance `h` [s].
     """
 
     def __init__(self, scene: Scene, loop: ClosedLoop, duration: float, h: float) -> None:
         self.loop, self.h, self.dry = loop, h, scene.dry[3:]
-        self.feedback, self.begun = Feedback(loop, duration), 0  # and its pieces so far
+        self.feedback, self.piece = Feedback(loop, duration), 0  # and its pieces so far
         inertia = np.array([finger.inertia for finger in scene.fingers])
-        # Dry friction is viscous below ten times the speed that it changes in a step.
+        # Dry friction is viscous below ten times its change of the speed in a step.
         self.viscous = inertia / (10.0 * h)
 
     def step(self, t: float, theta: Array, theta_dot: Array) -> Array:
         """Applied torques at a time, shape (2,) [N m]; times increase from zero."""
         torque = self.feedback.torque
-        while t + 0.5 * self.h >= torque.breaks[self.begun] and self.begun < len(torque.breaks) - 1:
-            self.feedback.begin(self.begun, theta, theta_dot, {})
-            self.begun += 1
-        tau = torque.coefficients[self.begun - 1, :, 0]
+        while t + 0.5 * self.h >= torque.breaks[self.piece] and self.piece < len(torque.breaks) - 1:
+            self.feedback.begin(self.piece, theta, theta_dot, {})
+            self.piece += 1
+        tau = torque.coefficients[self.piece - 1, :, 0]
         return np.asarray(tau - np.clip(self.viscous * theta_dot, -self.dry, self.dry))
 
 
 PARTS = 5  # equal parts of a stretch at whose ends the error is listed
-SLOW = 0.1  # share of the planned sliding speed below which a contact sticks
-PRESS = 0.25  # least normal force that counts, over the scene's force: 0.5 N in `problems/`
+STICK_RATIO = 0.1  # largest sliding speed of a contact that sticks, over the planned one
+LEAST = 0.25  # least considered normal force, over the scene's force: 0.5 N in `problems/`
 # Allowed error of the final pose, over the scene's length and in rad; soft contacts cause 2e-3.
 ALLOWED = 1e-2
 
@@ -369,7 +369,7 @@ class EngineInfo(NamedTuple):
     """A physics engine."""
 
     title: str
-    package: str  # that it is imported from
+    package: str  # Python package
     allowed: float  # error of the pose, over the scene's length and in rad
 
 
@@ -386,27 +386,27 @@ class Force(NamedTuple):
     phase: int
     contact: str
     planned: float
-    found: float
+    found: float  # in the engine
 
     @property
     def off(self) -> float:
-        """Error relative to the planned one."""
+        """Error relative to the planned force."""
         return (self.found - self.planned) / self.planned
 
 
 class Departure(NamedTuple):
-    """A stretch, compared with the plan."""
+    """Comparison of a stretch with the plan."""
 
     t: Array  # (n,) [s]: from the start of the plan
     position: Array  # (n,) [m]: error of the object's position
     angle: Array  # (n,) [rad]: error of its angle
     forces: tuple[Force, ...]
-    time: float | None  # [s]: when the error exceeds its limit
+    time: float | None  # [s]: from which on the error exceeds its limit
     reason: str  # the cause; empty without one
 
 
 class Level(NamedTuple):
-    """A replay with one setting: a comparison for each stretch."""
+    """Replays with one discretization: a comparison for each stretch."""
 
     setting: Setting
     departures: tuple[Departure, ...]
@@ -425,7 +425,7 @@ class EngineReport(Result):
     @property
     def ok(self) -> bool:
         """Whether no stretch exceeds the allowed error."""
-        return all(each.time is None for each in self.levels[0].departures)
+        return all(departure.time is None for departure in self.levels[0].departures)
 
     @property
     def converged(self) -> bool:
@@ -442,19 +442,19 @@ class EngineReport(Result):
         scales, (setting, departures) = self.problem.scene.scales, self.levels[0]
         millimetres, degrees = self.allowed * scales.length * 1e3, math.degrees(self.allowed)
         worst = max(float(np.max(each.position)) for each in departures) * 1e3
-        turned = math.degrees(max(float(np.max(each.angle)) for each in departures))
-        says = "departs" if self.converged else "departs with some settings only, here"
+        degrees_worst = math.degrees(max(float(np.max(each.angle)) for each in departures))
+        verb = "departs" if self.converged else "departs with some settings only, here"
         lines, errors, forces = list[str](), list[list[Any]](), list[tuple[Any, ...]]()
         for stretch, departure in zip(self.stretches, departures, strict=True):
             if departure.time is not None:
-                when = f"at t = {departure.time:.5g} s: {departure.reason}"
-                lines.append(f"phase {stretch.name} {says} {when}")
-            at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
-            sampled = np.interp(at, departure.t, departure.position)
+                event = f"at t = {departure.time:.5g} s: {departure.reason}"
+                lines.append(f"phase {stretch.name} {verb} {event}")
+            times = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
+            sampled = np.interp(times, departure.t, departure.position)
             largest = np.max(departure.position), np.max(departure.angle)
             errors.append([stretch.name, stretch.duration, *largest, *sampled])
             for force in departure.forces:
-                forces.append((*force, force.off if force.planned > PRESS * scales.force else None))
+                forces.append((*force, force.off if force.planned > LEAST * scales.force else None))
         levels = [
             [each.setting.step * scales.time, each.setting.softness]
             + [np.max(departure.position) for departure in each.departures]
@@ -464,48 +464,48 @@ class EngineReport(Result):
             f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
             "torques contain the dry friction of the joints, with its planned signs"
         )
-        off, press = fixed(min(millimetres, 0.09)), fixed(min(scales.force, 9.0), 5)
-        shares = [f"{k / PARTS:.0%} [mm]:{off}" for k in range(1, PARTS + 1)]
-        names = [f"{stretch.name} [mm]:{off}" for stretch in self.stretches]
-        heads = ["phase:d", "duration [s]:.6f", f"largest [mm]:{off}", "[deg]:.4f", *shares]
-        other = ["phase:d", "contact", f"planned mean c_n [N]:{press}", f"found [N]:{press}"]
-        other.append("off [%]:+.2f")
+        form, press = fixed(min(millimetres, 0.09)), fixed(min(scales.force, 9.0), 5)
+        columns = [f"{k / PARTS:.0%} [mm]:{form}" for k in range(1, PARTS + 1)]
+        names = [f"{stretch.name} [mm]:{form}" for stretch in self.stretches]
+        heads = ["phase:d", "duration [s]:.6f", f"largest [mm]:{form}", "[deg]:.4f", *columns]
+        means = ["phase:d", "contact", f"planned mean c_n [N]:{press}", f"found [N]:{press}"]
+        means.append("off [%]:+.2f")
         finer = ["step [s]:.3g", "softness:g", *names]
         return Document(
             f"{self.problem.name} in {self.title}",
             "ok" if self.ok else "DEPARTS" if self.converged else "NOT CONVERGED",
-            f"within {worst:{off}} mm and {turned:.4f} degrees of the plan "
+            f"within {worst:{form}} mm and {degrees_worst:.4f} degrees of the plan "
             f"(allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
-            [*lines, Table(heads, errors), Table(other, forces), Table(finer, levels)],
+            [*lines, Table(heads, errors), Table(means, forces), Table(finer, levels)],
         )
 
     @property
     def values(self) -> dict[str, Any]:
-        """The report for machines, in m, rad, s and N; null where an engine fails."""
+        """The values of the JSON document, in m, rad, s and N; null if an engine fails."""
         scales, levels = self.problem.scene.scales, list[dict[str, Any]]()
         for setting, departures in self.levels:
             stretches = list(map(_describe, self.stretches, departures))
-            own = {"step": setting.step * scales.time, "softness": setting.softness}
-            levels.append({**own, "stretches": stretches})
+            entry = {"step": setting.step * scales.time, "softness": setting.softness}
+            levels.append({**entry, "stretches": stretches})
         values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
         allowed = {"position": self.allowed * scales.length, "angle": self.allowed}
         return {**values, "converged": self.converged, "allowed": allowed, "levels": levels}
 
 
-def _describe(stretch: EngineStretch, found: Departure) -> dict[str, Any]:
-    departs = {"time": found.time, "reason": found.reason}
+def _describe(stretch: EngineStretch, departure: Departure) -> dict[str, Any]:
+    event = {"time": departure.time, "reason": departure.reason}
     return {
         "phases": stretch.numbers,
         "start": stretch.start,
         "stop": stretch.stop,
-        "largest": {"position": found.position.max(), "angle": found.angle.max()},
-        "departs": None if found.time is None else departs,
-        **{name: getattr(found, name) for name in ("forces", "t", "position", "angle")},
+        "largest": {"position": departure.position.max(), "angle": departure.angle.max()},
+        "departs": None if departure.time is None else event,
+        **{name: getattr(departure, name) for name in ("forces", "t", "position", "angle")},
     }
 
 
 def require_engine(name: str) -> Engine:
-    """The function that replays in an engine.
+    """The function of an engine that simulates a stretch.
 
     InputError if there is no such engine, or it is not installed.
     """
@@ -517,7 +517,7 @@ def require_engine(name: str) -> Engine:
     try:
         importlib.import_module(ENGINES[name].package)
     except ImportError as error:
-        # MuJoCo 4 without mujoco-core, for one.
+        # For example MuJoCo 4 without mujoco-core.
         raise InputError("", "--engine", f"{name}: {' '.join(str(error).split())}") from None
     engine: Engine = importlib.import_module(f".{name}", __package__).play
     return engine
@@ -526,7 +526,7 @@ def require_engine(name: str) -> Engine:
 def replay_in(
     engine: str,
     problem: Problem,
-    plan: Trajectory | Moved,
+    plan: Trajectory | MotionLike,
     *,
     whole: bool = False,
     setting: Setting | None = None,
@@ -534,7 +534,7 @@ def replay_in(
     halvings: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> EngineReport:
-    """Replay a plan open loop in an engine that does not know the contact sequence.
+    """Replay a plan in open loop in an engine, without prescribed contacts.
 
     Parameters
     ----------
@@ -552,14 +552,14 @@ def replay_in(
     problem, plan = adopt_motion(problem, plan)
     setting = setting or Setting()
     allowed = info.allowed if allowed is None else allowed
-    plan = find_between(plan)
+    plan = find_reference(plan)
     torque = apply_friction(problem.scene, plan)
     stretches = list_stretches(plan, [0] if whole else range(len(plan.motions)))
     levels = []
-    # Finer settings, and finer steps alone, with contacts as they are at first.
+    # Finer settings, then finer steps with the first stiffness of contacts.
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
-    same = [level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer) if k]
-    for level in [*finer, *same]:
+    steps = [level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer) if k]
+    for level in [*finer, *steps]:
         departures = []
         for stretch in stretches:
             if progress is not None:
@@ -580,90 +580,90 @@ def compare(
     """
     length, starts = problem.scene.scales.length, plan.phase_starts
     # Each phase includes the row at its end.
-    owner = np.searchsorted(starts[1:-1], run.t, side="left")
-    owner = np.clip(owner, stretch.phases[0], stretch.phases[-1])
-    owner[0] = stretch.phases[0]
+    phase_index = np.searchsorted(starts[1:-1], run.t, side="left")
+    phase_index = np.clip(phase_index, stretch.phases[0], stretch.phases[-1])
+    phase_index[0] = stretch.phases[0]
     error, forces = np.empty_like(run.z), list[Force]()
     changes = list[tuple[float, float, str]]()
     for index in stretch.phases:
         phase, motion = problem.phases[index], plan.motions[index]
-        rows, t = np.flatnonzero(owner == index), run.t - starts[index]
-        want = motion.evaluate(np.clip(t[rows], 0.0, motion.duration))
-        error[rows] = run.z[rows] - want.z
+        rows, t = np.flatnonzero(phase_index == index), run.t - starts[index]
+        planned = motion.evaluate(np.clip(t[rows], 0.0, motion.duration))
+        error[rows] = run.z[rows] - planned.z
         forces += _average(phase, motion, t, rows, run)
-        changes += _list_changes(phase, want, rows, run, allowed * length)
+        changes += _list_changes(phase, planned, rows, run, allowed * length)
     position, angle = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
-    beyond = np.flatnonzero(~(np.maximum(position / length, angle) <= allowed))
-    if not len(beyond):
+    exceeding = np.flatnonzero(~(np.maximum(position / length, angle) <= allowed))
+    if not len(exceeding):
         return Departure(run.t, position, angle, tuple(forces), None, "")
-    time = float(run.t[beyond[0]])
+    time = float(run.t[exceeding[0]])
     before = [change for change in changes if change[0] <= time]
-    # The first one that lasts until then, or else the last one before.
+    # The first one that lasts until that time, or else the last one before it.
     lasting = [change for change in before if change[1] >= time]
     reason = "every contact is as planned"
     if before:
-        start, _, what = min(lasting) if lasting else max(before, key=lambda change: change[1])
-        reason = f"{what} at t = {start:.5g} s"
+        start, _, deviation = min(lasting) if lasting else max(before, key=lambda change: change[1])
+        reason = f"{deviation} at t = {start:.5g} s"
     return Departure(run.t, position, angle, tuple(forces), time, reason)
 
 
 def _average(phase: Phase, motion: Motion, t: Array, rows: Numbers, run: EngineRun) -> list[Force]:
-    """Planned and found normal forces of a phase, averaged until the gained contact closes.
+    """Planned and actual normal forces of a phase, averaged until the gained contact closes.
 
-    Its gap closes at a vanishing speed: a small error of the pose closes it early. `t` are the
-    times of the run from the start of the phase on, which has some of its `rows`.
+    Its gap closes at a vanishing speed: a small error of the pose closes it early. `t` are times
+    of the run from the start of the phase, `rows` those of the phase.
     """
-    scene, every = phase.formation.scene, rows[rows > 0]
-    ends = run.cut(every, phase.until.contact, scene)
-    ends = ends if len(ends) else every[:1]
-    middles = (np.arange(2000) + 0.5) / 2000 * min(t[ends[-1]], motion.duration)
+    scene, inner = phase.formation.scene, rows[rows > 0]
+    closed_before = run.cut(inner, phase.until.contact, scene)
+    closed_before = closed_before if len(closed_before) else inner[:1]
+    middles = (np.arange(2000) + 0.5) / 2000 * min(t[closed_before[-1]], motion.duration)
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
-    share = np.diff(run.t)[ends - 1]
-    press = share @ run.press[ends - 1] / share.sum()
+    weights = np.diff(run.t)[closed_before - 1]
+    press = weights @ run.press[closed_before - 1] / weights.sum()
     mean_forces = [float(press[run.find_columns(name, scene)].sum()) for name in motion.contacts]
     means = zip(motion.contacts, planned, mean_forces, strict=True)
     return [Force(phase.number, *mean) for mean in means]
 
 
 def _list_changes(
-    phase: Phase, want: Samples, rows: Numbers, run: EngineRun, reach: float
+    phase: Phase, planned_motion: Samples, rows: Numbers, run: EngineRun, departure: float
 ) -> Iterator[tuple[float, float, str]]:
-    """Deviations of contacts from the plan in a phase: their intervals [s], and in words."""
+    """Deviations of contacts from the plan in a phase: start and end [s], and description."""
     formation, scales = phase.formation, phase.formation.scene.scales
     flags = list[tuple[str, Flags, Array]]()
     t, moves = run.t[rows], 2e-3 * scales.speed
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
-    planned = formation.evaluate(want.z, want.z_dot)
+    planned = formation.evaluate(planned_motion.z, planned_motion.z_dot)
     slides = np.einsum("nij,nj->ni", actual.A_t, run.z_dot[rows])
-    meant = np.einsum("nij,nj->ni", planned.A_t, want.z_dot)
+    planned_slides = np.einsum("nij,nj->ni", planned.A_t, planned_motion.z_dot)
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
         pressing[:, run.find_columns(name, formation.scene)] = 0.0
-        flags.append((f"{name} opens", actual.C[:, k] > 0.1 * reach, t))
-        slide, planned_slide = np.abs(slides[:, k]), np.abs(meant[:, k])
+        flags.append((f"{name} opens", actual.C[:, k] > 0.1 * departure, t))
+        slide, planned_slide = np.abs(slides[:, k]), np.abs(planned_slides[:, k])
         if k in formation.rolling_rows:
             flags.append((f"{name} slips", slide > moves, t))
         else:
-            held = (planned_slide > moves) & (slide < SLOW * planned_slide)
-            flags.append((f"{name} sticks", held, t))
+            sticking = (planned_slide > moves) & (slide < STICK_RATIO * planned_slide)
+            flags.append((f"{name} sticks", sticking, t))
     for name, force in zip(run.pairs, pressing.T, strict=True):
-        hits = force > PRESS * scales.force
+        hits = force > LEAST * scales.force
         flags.append((f"{name} presses, which is not planned,", hits, run.t[rows[rows > 0]]))
-    for what, happens, times in flags:
-        for span in find_runs(happens):
-            yield float(times[span.start]), float(times[span.stop - 1]), what
+    for text, mask, times in flags:
+        for span in find_runs(mask):
+            yield float(times[span.start]), float(times[span.stop - 1]), text
 
 
 class StretchEnd(NamedTuple):
-    """A stretch that a policy carries out in an engine."""
+    """End of a stretch that a policy carries out in an engine."""
 
     stretch: EngineStretch
     duration: float  # [s]: until the joints are at rest at the end
-    over: bool  # whether they are
+    over: bool  # whether they came to rest
     position: float  # [m]: final error of the object's position
-    angle: float  # [rad]: of its angle
-    contact: str  # the planned contact that opens most during its phase
-    gap: float  # [m]: its gap
+    angle: float  # [rad]: final error of its angle
+    contact: str  # the planned contact with the largest gap during its phase
+    gap: float  # [m]: this gap
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -681,9 +681,9 @@ class PolicyReport(Result):
         return all(self.find_failure(end) is None for end in self.arrivals)
 
     def find_failure(self, end: StretchEnd) -> str | None:
-        """Description of a failure, if there is one."""
-        far = max(end.position / self.problem.scene.scales.length, end.angle)
-        if not far <= self.allowed:
+        """Description of a failure, or None."""
+        error = max(end.position / self.problem.scene.scales.length, end.angle)
+        if not error <= self.allowed:
             text = f"{end.position * 1e3:.3g} mm and {math.degrees(end.angle):.3g} degrees"
             return f"phase {end.stretch.name} ends {text} away from the plan"
         if not end.over:
@@ -693,11 +693,11 @@ class PolicyReport(Result):
     @property
     def document(self) -> Document:
         """Durations and final errors."""
-        off = fixed(min(1e3 * self.allowed * self.problem.scene.scales.length, 0.09))
+        form = fixed(min(1e3 * self.allowed * self.problem.scene.scales.length, 0.09))
         columns = {
             "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
-            "duration": "policy [s]:.6f", "position": f"end off [mm]:{off}", "angle": "[deg]:.4f",
-            "gap": f"largest gap [mm]:{off}", "contact": "",
+            "duration": "policy [s]:.6f", "position": f"end off [mm]:{form}", "angle": "[deg]:.4f",
+            "gap": f"largest gap [mm]:{form}", "contact": "",
         }  # fmt: skip
         failures = [self.find_failure(end) or "" for end in self.arrivals]
         title = f"{self.problem.name} in {self.title}, by the policy"
@@ -706,7 +706,7 @@ class PolicyReport(Result):
 
     @property
     def values(self) -> dict[str, Any]:
-        """The report for machines, in m, rad and s."""
+        """The values of the JSON document, in m, rad and s."""
         stretches = [{"phases": end.stretch.numbers, **end._asdict()} for end in self.arrivals]
         for stretch in stretches:
             del stretch["stretch"]
@@ -717,7 +717,7 @@ class PolicyReport(Result):
 def play_policy(
     engine: str,
     problem: Problem,
-    plan: Trajectory | Moved,
+    plan: Trajectory | MotionLike,
     policy: Policy,
     *,
     whole: bool = False,
@@ -725,7 +725,7 @@ def play_policy(
     allowed: float = ALLOWED,
     progress: Callable[[str], None] | None = None,
 ) -> PolicyReport:
-    """Simulate a policy in an engine that does not know the contact sequence.
+    """Simulate a policy in an engine, without prescribed contacts.
 
     Parameters
     ----------
@@ -742,10 +742,10 @@ def play_policy(
     info = ENGINES[engine]
     setting = setting or Setting()
     arrivals = []
-    # From rest; what comes to rest a little late in the replay still moves.
-    begins, rest = [0] if whole else [number - 1 for number in policy.resting], np.zeros(5)
-    for stretch in list_stretches(find_between(plan), begins):
-        stretch = stretch._replace(z_dot=rest, z_ddot=rest)
+    # From rest; at these instants the replay may still move slowly.
+    firsts, zero = [0] if whole else [number - 1 for number in policy.resting], np.zeros(5)
+    for stretch in list_stretches(find_reference(plan), firsts):
+        stretch = stretch._replace(z_dot=zero, z_ddot=zero)
         if progress is not None:
             progress(f"phase {stretch.name} in {info.title}")
         last = stretch.phases[-1] + 1
@@ -760,13 +760,13 @@ def play_policy(
 def _judge(
     problem: Problem, plan: Trajectory, stretch: EngineStretch, loop: ClosedLoop, run: EngineRun
 ) -> StretchEnd:
-    """Final error of a run, and the planned contact that opens most."""
+    """Final error of a run, and the planned contact with the largest gap."""
     goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
-    away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
-    position, angle = float(np.hypot(*away[:2])), float(away[2])
-    begins = [loop.began.get(index + 1, np.inf) for index in stretch.phases]
+    error, t = np.abs(run.z[-1] - goal), run.t - stretch.start
+    position, angle = float(np.hypot(*error[:2])), float(error[2])
+    starts = [loop.phase_starts.get(index + 1, np.inf) for index in stretch.phases]
     contact, gap = "", 0.0
-    for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
+    for index, start, stop in zip(stretch.phases, starts, [*starts[1:], np.inf], strict=True):
         phase = problem.phases[index]
         rows = np.flatnonzero((t >= start) & (t < stop))
         rows = run.cut(rows, phase.until.contact, problem.scene)

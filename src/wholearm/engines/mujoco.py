@@ -1,7 +1,7 @@
 """MuJoCo: a scene and a plan's torques as an MJCF file, written without MuJoCo, and replays in it.
 
 Positions are z = (x, y, phi, theta_1, theta_2), with the start of the motion as the model's own
-position and as the keyframe ``home``. What else a plan adds is described in `add_clock`.
+position and as the keyframe ``home``. `add_clock` describes the further elements of a plan.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import require_number
 from ..problem.definition import Problem
-from ..results.adopt import Moved, adopt_motion
+from ..results.adopt import MotionLike, adopt_motion
 from ..results.torque import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from . import engine_replay as engine
 
-SHARE = 1e-6
+ANGLE_WEIGHT = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
-BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
+RAMP_ERROR = 1e-3  # Largest error of the ramps, relative to the largest torque
 CLOCK = "clock"
 HIDDEN = {"group": 3}
-"""Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
+"""Group of joints and actuators that have no sliders in MuJoCo's viewer by default."""
 # In a convex contact model sliding separates the surfaces at a rate that falls with the time
 # constant of friction and with the impedance.
-PRESS = 7.5  # time constant of the gap (critically damped), in time steps
-RUB = 300.0  # time constant of the sliding speed, in time steps
-IMPEDANCE = 0.01  # share of the unconstrained motion that a contact takes away
+GAP_STEPS = 7.5  # time constant of the gap (critically damped), in time steps
+SLIDE_STEPS = 300.0  # time constant of the sliding speed, in time steps
+IMPEDANCE = 0.01  # fraction of the unconstrained motion that a contact removes
 RATIO = 100.0  # impedance of friction over that of the gap
 
 
 def write_mjcf(
     problem: Problem,
-    plan: Trajectory | Moved | None = None,
+    plan: Trajectory | MotionLike | None = None,
     *,
     step: float | None = None,
     softness: float = 1.0,
@@ -49,7 +49,7 @@ def write_mjcf(
     ----------
     plan        its torques are part of the model, and each of its phases has a keyframe at its
                 start
-    step : [s]  that of `Setting` when left out
+    step : [s]  time step; that of `Setting` by default
     softness    factor of the time constants of contacts
 
     InputError if a link has no thickness, or a number is not positive.
@@ -72,17 +72,17 @@ def write_mjcf(
     _add_bodies(world, scene, home)
     contact = add(root, "contact")
     for pair in engine.list_pairs(scene):
-        rough = pair.friction > 0
+        has_friction = pair.friction > 0
         add(
             contact,
             "pair",
             name=pair.name,
             geom1=pair.first,
             geom2=pair.second,
-            condim="3" if rough else "1",
-            friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
-            solref=[softness * PRESS * step, 1.0],
-            solreffriction=[softness * RUB * step, 1.0],
+            condim="3" if has_friction else "1",
+            friction=[pair.friction, pair.friction, 0, 0, 0] if has_friction else [1, 1, 0, 0, 0],
+            solref=[softness * GAP_STEPS * step, 1.0],
+            solreffriction=[softness * SLIDE_STEPS * step, 1.0],
             solimp=[IMPEDANCE, IMPEDANCE, 1.0],
         )
     motors = add(root, "actuator")
@@ -100,14 +100,14 @@ def write_mjcf(
 
 
 def _add_options(root: Element, scene: Scene, step: float) -> None:
-    """Units and solver, and how a viewer shows the scene."""
+    """Add units, solver, and settings of a viewer."""
     size, depth = scene.polygon.size, scene.polygon.size / 20
     add(root, "compiler", angle="radian", autolimits="true")
     # MuJoCo 4.0.0 factorises sparse Hessians wrongly; its midphase drops shapes this thin.
     solver_options = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
     gravity = [0.0, -scene.gravity, 0.0]
-    tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": RATIO}
-    option = add(root, "option", timestep=step, gravity=gravity, **tight, **solver_options)
+    accuracy = {"tolerance": 1e-12, "cone": "elliptic", "impratio": RATIO}
+    option = add(root, "option", timestep=step, gravity=gravity, **accuracy, **solver_options)
     add(option, "flag", midphase="disable")
     add(root, "statistic", center=[0.0, size / 2, 0.0], extent=2 * size)
     visual = add(root, "visual")
@@ -118,36 +118,36 @@ def _add_options(root: Element, scene: Scene, step: float) -> None:
 
 
 def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None:
-    """A shape that touches only what pairs say."""
+    """Add a shape that touches only others in its pairs."""
     add(body, "geom", name=name, type=kind, contype="0", conaffinity="0", **attributes)
 
 
 def _add_bodies(world: Element, scene: Scene, z: Array) -> None:
-    """Object and links at a configuration, shape (5,), on their joints."""
+    """Add object and links at a configuration, shape (5,), on their joints."""
     polygon, (x, y, phi, *theta) = scene.polygon, z.tolist()
     body = add(world, "body", name=engine.OBJECT, pos=[x, y, 0.0])
     add(body, "inertial", pos=[0, 0, 0], mass=polygon.mass, diaginertia=[polygon.inertia] * 3)
     for axis, (name, kind) in enumerate((("x", "slide"), ("y", "slide"), ("phi", "hinge"))):
         add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=z[axis])
-    turned = [0.0, 0.0, phi]
-    _add_geom(body, engine.OBJECT, "mesh", mesh=engine.OBJECT, euler=turned, rgba=".9 .7 .3 1")
+    rotation = [0.0, 0.0, phi]
+    _add_geom(body, engine.OBJECT, "mesh", mesh=engine.OBJECT, euler=rotation, rgba=".9 .7 .3 1")
     _add_shapes(body, scene, phi)
     for k, link in enumerate(scene.fingers):
         place = [*np.asarray(link.base), 0.0]
-        # The weight of links is no part of the model.
+        # Links have no weight.
         body = add(world, "body", name=engine.LINKS[k], pos=place, gravcomp="1")
-        # A uniform rod. MuJoCo makes the stiffness of a contact of how bodies move at their centres
-        # of mass: at the joint that is not at all, and contacts of light links are too stiff.
+        # A uniform rod. In MuJoCo the stiffness of a contact depends on the motion of centres of
+        # mass: with one at the joint, which does not move, contacts of light links are too stiff.
         middle = link.length / 2 * np.array([np.cos(theta[k]), np.sin(theta[k]), 0.0])
         rod = {"mass": 3 * link.inertia / link.length**2, "diaginertia": [link.inertia / 4] * 3}
         add(body, "inertial", pos=middle, **rod)
-        turn = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
-        add(body, "joint", name=f"theta{k + 1}", type="hinge", **turn)
+        hinge = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
+        add(body, "joint", name=f"theta{k + 1}", type="hinge", **hinge)
         _add_shapes(body, scene, theta[k])
 
 
 def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
-    """Balls and capsules, turned so that they are in place at the model's own position."""
+    """Add balls and capsules, rotated to their places at the model's own position."""
     c, s = np.cos(angle), np.sin(angle)
     for shape in engine.list_shapes(scene):
         if shape.body == body.get("name"):
@@ -159,20 +159,20 @@ def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
 def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> None:
     """Add clock, tendons, springs, and a keyframe for the start and for each phase.
 
-    At the start of a time step the lines between rows of torque are at the average over that step,
-    so that torques that jump within one have the right effect.
+    At the start of a time step the lines between rows of torque have the mean over that step, so
+    that torques that jump within a step have the right effect.
     """
     parts = {part.tag: part for part in root}
-    rows = place_rows(engine.apply_friction(scene, plan), BEND)
-    t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
-    t[again] -= step / 2
-    t[again + 1] += step / 2
-    # Rows that are nearer to a step than that keep their order, a millionth of a step apart.
+    rows = place_rows(engine.apply_friction(scene, plan), RAMP_ERROR)
+    t, jumps = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    t[jumps] -= step / 2
+    t[jumps + 1] += step / 2
+    # Rows that are nearer to a jump keep their order, at distances of a millionth of a step.
     t, tau = np.maximum.accumulate(t) + 1e-6 * step * np.arange(len(t)), rows[:, 1:]
-    share = SHARE * scene.scales.time
-    rises = np.diff(tau, axis=0) / share
-    # The clock is driven by much more force than all springs exert.
-    drive = 1e9 * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
+    weight = ANGLE_WEIGHT * scene.scales.time
+    rises = np.diff(tau, axis=0) / weight
+    # The force that drives the clock is much larger than those of all springs.
+    drive = 1e9 * (np.abs(rises).sum() + np.abs(tau[0]).sum() / weight + scene.scales.force)
     body = add(parts["worldbody"], "body", name=CLOCK)
     add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
     add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)
@@ -182,8 +182,8 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
     for k, name in enumerate(("torque1", "torque2")):
         tendon = add(tendons, "fixed", name=name)
         add(tendon, "joint", joint=CLOCK, coef=1)
-        add(tendon, "joint", joint=f"theta{k + 1}", coef=share)
-        first = [tau[0, k] / share, 0, 0]
+        add(tendon, "joint", joint=f"theta{k + 1}", coef=weight)
+        first = [tau[0, k] / weight, 0, 0]
         add(springs, "general", name=f"{name}-start", tendon=name, biasprm=first, **spring)
         for row in np.flatnonzero(rises[:, k]):
             rise, slope = rises[row, k], rises[row, k] / (t[row + 1] - t[row])
@@ -212,7 +212,7 @@ def add(parent: Element, tag: str, **attributes: object) -> Element:
 def play(
     problem: Problem, stretch: engine.EngineStretch, torque: engine.Drive, setting: engine.Setting
 ) -> engine.EngineRun:
-    """Replay a stretch in MuJoCo; an `Engine`."""
+    """Simulate a stretch in MuJoCo; an `Engine`."""
     import mujoco
 
     steps = engine.list_steps(problem, stretch, torque, setting.step)
@@ -228,10 +228,10 @@ def play(
         numbers[first, second] = numbers[second, first] = number
 
     def collect(total: Array, find: Callable[[Any], Array]) -> None:
-        """Add to totals of pairs what `find` has for the rows of their constraints."""
-        contact, held = data.contact, data.contact.efc_address >= 0
-        pair = numbers[contact.geom1[held], contact.geom2[held]]
-        np.add.at(total, pair, find(contact.efc_address[held]))
+        """Add the values of `find` for rows of constraints to the totals of their pairs."""
+        contact, active = data.contact, data.contact.efc_address >= 0
+        pair = numbers[contact.geom1[active], contact.geom2[active]]
+        np.add.at(total, pair, find(contact.efc_address[active]))
 
     def advance(start: int, end: int) -> Array:
         total = np.zeros(len(pairs))
@@ -246,13 +246,13 @@ def play(
         return total / (end - start)
 
     # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
-    data.qpos[:], stiffnesses = engine.press_in(problem, stretch), np.zeros(len(pairs))
+    data.qpos[:], stiffnesses = engine.penetrate_start(problem, stretch), np.zeros(len(pairs))
     mujoco.mj_forward(model, data)
     collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
     stiffness = dict(zip((pair.name for pair in pairs), stiffnesses.tolist(), strict=True))
     mujoco.mj_resetData(model, data)
-    data.qpos[:], data.qvel[:] = engine.press_in(problem, stretch, stiffness), steps.v
-    # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
+    data.qpos[:], data.qvel[:] = engine.penetrate_start(problem, stretch, stiffness), steps.v
+    # No warnings of states that are not finite, on stderr and in a file: the deviation has them.
     mujoco.set_mju_user_warning(lambda _: None)
     state = lambda: (data.qpos.copy(), data.qvel.copy())  # noqa: E731
     run = engine.record(stretch, steps, pairs, advance, state)

@@ -1,7 +1,7 @@
 """The contact-formation map as a figure; nothing is shown and no global state is touched.
 
-In its SVG what can be clicked in a page has the id ``place-k``: parts of cells in the order of
-`split`, then borders with an edge flush, then crossings.
+In its SVG the elements that can be clicked in a page have ids ``place-k``: parts of cells in the
+order of `split_regions`, then borders with an edge flush, then crossings.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ..common.arrays import Array, Flags, Numbers, find_runs, interpolate
 from ..common.sharing import exclusive
 from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
-from ..results.adopt import Moved
+from ..results.adopt import MotionLike
 from ..results.trajectory import Trajectory
 from .style import INK, add_line, inset, open_figure, write, write_title
 
@@ -46,11 +46,11 @@ _ARROW = np.array(
 
 
 @exclusive
-def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Figure:
+def draw_map(chart: FormationMap, plan: Trajectory | MotionLike | None = None) -> Figure:
     """Draw a contact-formation map.
 
-    The path of `plan` is drawn over the map, phase by phase; by default that of the problem's own
-    phases, as far as geometry alone gives it. The figure has one axes: x [mm] and phi [deg].
+    The path of `plan` is drawn over the map, phase by phase; by default that of the problem's
+    phases, as far as geometry determines it. The figure has one axes: x [mm] and phi [deg].
     """
     problem = chart.problem
     paths = trace_problem(problem) if plan is None else []
@@ -82,11 +82,11 @@ class _Drawing:
         self.axes.set(ylim=self.phi[[0, -1]], ylabel="orientation \u03c6 [deg]")
         # Points per mm and per deg.
         self.scale = 72.0 * np.array(BOX[2:]) / [np.ptp(self.x), np.ptp(self.phi)]
-        self.parts = list(split(chart.cell))
+        self.parts = list(split_regions(chart.cell))
         self.gids = (f"{PLACE}{k}" for k in count())
 
     def draw_cells(self) -> None:
-        """Fill the cells, in other tints than their neighbours, and hatch what is not reached."""
+        """Fill the cells, in tints that differ from their neighbours', and hatch the rest."""
         cell = self.chart.cell
         size = int(cell.max()) + 1
         touching = np.zeros((size, size), dtype=bool)
@@ -95,8 +95,8 @@ class _Drawing:
             touching[one[both], other[both]] = touching[other[both], one[both]] = True
         tints = np.full(size, -1)
         for k in np.argsort(-touching.sum(axis=1), kind="stable"):
-            used = set(tints[touching[k]].tolist())
-            tints[k] = next((tint for tint in range(len(_TINTS)) if tint not in used), 0)
+            used_tints = set(tints[touching[k]].tolist())
+            tints[k] = next((tint for tint in range(len(_TINTS)) if tint not in used_tints), 0)
         for index, region in self.parts:
             face, gid = _TINTS[tints[index]], next(self.gids)
             self._add(self._outline(region), fc=face, lw=0, aa=False, gid=gid, zorder=0)
@@ -124,13 +124,13 @@ class _Drawing:
         self.axes.text(float(place[0]), float(place[1]), text, ha="center", va="center", **look)
 
     def draw_labels(self) -> list[Array]:
-        """Name the cells; returns the corners (low, high) of what was written over, each (2, 2)."""
+        """Name the cells; returns the corners (low, high) of the texts, each (2, 2)."""
         clear = np.ones(self.chart.cell.shape, dtype=bool)
         for path in self.paths:
-            across = (np.subtract.outer(self.x, path[:, 0]) * self.scale[0]) ** 2
-            upright = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
+            dx = (np.subtract.outer(self.x, path[:, 0]) * self.scale[0]) ** 2
+            dy = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
             # 8 points from the plan.
-            clear &= (across[None] + upright[:, None]).min(axis=2) > 64.0
+            clear &= (dx[None] + dy[:, None]).min(axis=2) > 64.0
         # A star: the vertex is on the tip's arc.
         names = [
             " | ".join(f"{c.corner}{'*' * (c.surface == 'tip' and c.feature == 'v')}" for c in each)
@@ -149,15 +149,15 @@ class _Drawing:
         if not region.any():
             return None
         step = np.array([self.phi[1] - self.phi[0], self.x[1] - self.x[0]]) * self.scale[::-1]
-        flat = np.array([6.5, 2.2 * len(text) + 1.0])  # a letter is 4.4 points wide
-        # Measured in half labels, the room around a place is the largest label that fits. Cells of
-        # discs are narrow: there it stands upright.
-        for half, turn in ((flat, 0), (flat[::-1], 90)):
+        label = np.array([6.5, 2.2 * len(text) + 1.0])  # a letter is 4.4 points wide
+        # Measured in half labels, the room around a place is the largest label that fits. In narrow
+        # cells, as of discs, the label is upright.
+        for half, angle in ((label, 0), (label[::-1], 90)):
             row, column, room = find_room(region, step / half)
             if room >= 1.15:
                 place = np.array([self.x[column], self.phi[row]])
                 size = (half[::-1] + 3) / self.scale
-                style: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": turn} | look
+                style: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": angle} | look
                 # Over lines, arrows and hatching.
                 style["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]
                 self._write(place, text, **style)
@@ -165,45 +165,45 @@ class _Drawing:
         return None
 
     def draw_directions(self, boxes: Sequence[Array]) -> None:
-        """Small arrows towards which a quasistatic motion inside a cell is possible."""
+        """Small arrows in directions in which a quasistatic motion inside a cell is possible."""
         places = _to_axes(self.chart.places)
         free = np.ones(len(places), dtype=bool)
         for low, high in boxes:
             free &= ~((places > low) & (places < high)).all(axis=1)
-        for k, way in enumerate(np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])):
-            arrow = _ARROW @ np.array([way, way[::-1]]) / self.scale
+        for k, direction in enumerate(np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])):
+            arrow = _ARROW @ np.array([direction, direction[::-1]]) / self.scale
             starts = places[free & self.chart.possible[:, k], None]
             self._add(starts + arrow, fc=_FREE, lw=0, zorder=2)
         crosses = places[free & self.chart.ambiguous]
         add_line(self.axes, crosses, marker="x", ms=3.5, ls="none", color=_AMBIGUOUS, zorder=2)
 
     def draw_borders(self) -> None:
-        """Borders with lines beside them to where motions are possible, and crossings.
+        """Borders, lines beside them where motions are possible, and crossings.
 
-        Beside the axes stands which edge lies on the palm.
+        Texts beside the axes name the edge that lies on the palm.
         """
         flush = [border for border in self.chart.borders if border.flush is not None]
         passing = [_to_axes(border.points) for border in self.chart.borders if border.flush is None]
-        every = [_to_axes(border.points) for border in flush]
+        lines = [_to_axes(border.points) for border in flush]
         self._add_lines(passing, _LINE, zorder=3, **_PASSING)
-        self._add_lines(every, _LINE, lw=0.9, zorder=3)
+        self._add_lines(lines, _LINE, lw=0.9, zorder=3)
 
-        def cut(lines: Sequence[Array], name: str) -> Iterator[Array]:
-            for border, points in zip(flush, lines, strict=True):
-                yield from (points[run] for run in find_runs(getattr(border, name), least=2))
+        def cut(borders: Sequence[Array], name: str) -> Iterator[Array]:
+            for border, points in zip(flush, borders, strict=True):
+                yield from (points[run] for run in find_runs(getattr(border, name), min_length=2))
 
-        for colour, way, name in ((_FORTH, 1.0, "forth"), (_BACK, -1.0, "back")):
+        for colour, sign, name in ((_FORTH, 1.0, "forth"), (_BACK, -1.0, "back")):
             # 2.6 points beside the border.
-            strips = [shift(run * self.scale, way * 2.6) for run in cut(every, name)]
+            strips = [offset_line(run * self.scale, sign * 2.6) for run in cut(lines, name)]
             self._add_lines([strip / self.scale for strip in strips], colour, lw=1.3, zorder=4)
-            heads = np.concatenate([np.empty((0, 3, 2)), *(place_heads(s, way) for s in strips)])
+            heads = np.concatenate([np.empty((0, 3, 2)), *(place_heads(s, sign) for s in strips)])
             self._add(heads / self.scale, fc=colour, lw=0, zorder=5)
-        self._add_lines(list(cut(every, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
-        for points in every:
+        self._add_lines(list(cut(lines, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
+        for points in lines:
             add_line(self.axes, points, lw=9, alpha=0.0, zorder=5.5, gid=next(self.gids))
         dot: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "ls": "none"}
         for crossing in self.chart.crossings:
-            # Where only a contact changes its name on a border the dot is small.
+            # The dot is small if only a contact changes its name on a border.
             size = 3.6 if len(crossing.flush) >= 2 else 2.4
             point, gid = _to_axes(crossing.point[None]), next(self.gids)
             add_line(self.axes, point, ms=size, zorder=6, gid=gid, **dot)
@@ -227,7 +227,7 @@ class _Drawing:
             self._write(leader[1], str(number), **look)
 
     def draw_legend(self) -> None:
-        """What lines and colours mean."""
+        """Legend of lines and colours."""
         arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
         line, chart = partial(Line2D, [], []), self.chart
         handles: list[Any] = [
@@ -261,79 +261,80 @@ def _to_axes(points: Array) -> Array:
 
 
 def _head(run: Array) -> Array:
-    """Unit vectors along `run`, (n, 2), zero where it is."""
+    """Unit vectors along `run`, (n, 2); zero vectors stay zero."""
     return np.asarray(run / np.maximum(np.hypot(*run.T), 1e-12)[:, None])
 
 
-def shift(points: Array, distance: float) -> Array:
-    """A polyline moved to its right, seen along it with the second coordinate upwards."""
+def offset_line(points: Array, distance: float) -> Array:
+    """A polyline with an offset to its right, with the second coordinate upwards."""
     run = _head(np.gradient(points, axis=0))
     return np.asarray(points + distance * np.column_stack([run[:, 1], -run[:, 0]]))
 
 
 def _measure(points: Array) -> Array:
-    """Lengths of a polyline up to its points, shape (n,)."""
+    """Arc lengths of a polyline at its points, shape (n,)."""
     return np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
 
 
-def find_middle(points: Array, share: float = 0.5) -> Array:
-    """The place half way along a polyline, or a share of it, shape (2,)."""
+def find_middle(points: Array, fraction: float = 0.5) -> Array:
+    """The place at a fraction of the length of a polyline, shape (2,)."""
     s = _measure(points)
-    return interpolate(share * s[-1], s, points)
+    return interpolate(fraction * s[-1], s, points)
 
 
-def place_heads(points: Array, way: float) -> Array:
+def place_heads(points: Array, direction: float) -> Array:
     """Corners of arrow heads on a polyline, one every 42 points, shape (n, 3, 2)."""
     s = _measure(points)
     number = int(s[-1] // 42.0) + int(s[-1] > 12.0)
     places = (np.arange(number) + 0.5) * s[-1] / max(number, 1)
     k = np.searchsorted(s, places)
-    run = _head(way * (points[k] - points[k - 1]))
+    run = _head(direction * (points[k] - points[k - 1]))
     frame = np.stack([run, np.column_stack([-run[:, 1], run[:, 0]])], axis=1)
     return np.asarray(interpolate(places, s, points)[:, None] + _HEAD @ frame)
 
 
 def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) -> Array:
-    """Places for the numbers of paths, on them or beside them, none over another, shape (m, 2).
+    """Places without overlap for the numbers of paths, on them or beside them, shape (m, 2).
 
     Paths, (n, 2), the diameter `size` of the discs, and the corners `low` and `high` of the paper,
     (2,), are in units of the paper.
     """
     angles = np.pi / 8 * (np.arange(16) + 4)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
-    aside = np.concatenate([radius * size * ring for radius in (1.0, 1.6, 2.3, 3.2, 4.2)])
+    offsets = np.concatenate([radius * size * ring for radius in (1.0, 1.6, 2.3, 3.2, 4.2)])
     discs = np.empty((0, 2))
     for path in paths:
-        on = [find_middle(path, share) for share in (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)]
-        every = np.concatenate([on, on[0] + aside])
-        clear = np.hypot(*(every[:, None] - discs[None]).transpose(2, 0, 1)) >= size
-        inside = ((every >= low + size / 2) & (every <= high - size / 2)).all(axis=1)
-        discs = np.vstack([discs, every[(clear.all(axis=1) & inside).argmax()]])
+        on_path = [find_middle(path, fraction) for fraction in (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)]
+        candidates = np.concatenate([on_path, on_path[0] + offsets])
+        clear = np.hypot(*(candidates[:, None] - discs[None]).transpose(2, 0, 1)) >= size
+        inside = ((candidates >= low + size / 2) & (candidates <= high - size / 2)).all(axis=1)
+        discs = np.vstack([discs, candidates[(clear.all(axis=1) & inside).argmax()]])
     return discs
 
 
-def split(cell: Numbers) -> Iterator[tuple[int, Flags]]:
-    """The parts of a grid that hang together by sides of its places, each with whose it is.
+def split_regions(cell: Numbers) -> Iterator[tuple[int, Flags]]:
+    """Connected regions (4-neighbourhood) of a grid with equal cells, each with its cell.
 
-    `cell` says for each place whose it is, negative: nobody's. Parts come by owner, from below.
+    `cell` has the number of the cell at each place, or a negative one. Regions are in the order of
+    cells, from below.
     """
     from scipy.ndimage import label
 
-    for owner in range(int(cell.max()) + 1):
-        parts, count = label(cell == owner)
-        yield from ((owner, parts == k) for k in range(1, count + 1))
+    for index in range(int(cell.max()) + 1):
+        regions, count = label(cell == index)
+        yield from ((index, regions == k) for k in range(1, count + 1))
 
 
 def find_room(region: Flags, step: Array) -> tuple[int, int, float]:
-    """Where a region is widest: row, column, and the distance to its edge there.
+    """Centre of the largest inscribed circle of a region: row, column, and radius.
 
-    `step` are the distances of rows and of columns, shape (2,). What lies beyond the grid
-    is outside of the region.
+    `step` are the distances of rows and of columns, shape (2,). Places beyond the grid are outside
+    of the region.
     """
     from scipy.ndimage import distance_transform_edt, find_objects
 
-    (around,) = find_objects(region.astype(int))
-    room = distance_transform_edt(np.pad(region[around], 1), sampling=step)[1:-1, 1:-1]
+    (box,) = find_objects(region.astype(int))
+    room = distance_transform_edt(np.pad(region[box], 1), sampling=step)[1:-1, 1:-1]
     row, column = np.unravel_index(int(room.argmax()), room.shape)
-    place = int(row) + around[0].start, int(column) + around[1].start
+    place = int(row) + box[0].start, int(column) + box[1].start
     return *place, float(room[row, column])

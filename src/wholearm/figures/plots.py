@@ -30,8 +30,8 @@ from ..common.errors import InputError, require_number
 from ..common.files import require_ending, write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
-from ..problem.read import read_own_problem
-from ..results.adopt import Torques, narrow
+from ..problem.read import read_stored_problem
+from ..results.adopt import Torques, split_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
 CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that gives the scale [in]
-# What is simulated; the torque of finger 2 has longer gaps, to be told from that of finger 1.
+# Style of simulated curves; that of the torque of finger 2 has longer gaps.
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
 
 
@@ -83,8 +83,8 @@ def draw_snapshot(
 
 def draw_palm(axes: Axes, scene: Scene, left: float, right: float) -> Artist:
     """Draw the palm between two x [m]."""
-    deep = style.PALM * scene.scales.length
-    palm = Rectangle((left, -deep), right - left, deep, fc=style.INK, linewidth=0, zorder=1)
+    depth = style.PALM * scene.scales.length
+    palm = Rectangle((left, -depth), right - left, depth, fc=style.INK, linewidth=0, zorder=1)
     return axes.add_patch(palm)
 
 
@@ -94,9 +94,9 @@ def draw_bodies(axes: Axes, scene: Scene, z: Array, **look: Any) -> list[Artist]
     shapes += [*place_object(scene, z[None])]
     artists: list[Artist] = []
     looks = (*((*colours, 0.9, 2) for colours in style.FINGERS), (style.INK, style.BODY, 1.1, 4))
-    for points, (line, face, wide, above) in zip(shapes, looks, strict=True):
-        own: dict[str, Any] = {"fc": face, "ec": line, "lw": wide, "zorder": above} | look
-        artists.append(axes.add_artist(Polygon(points, **own)))
+    for points, (line, face, width, order) in zip(shapes, looks, strict=True):
+        options: dict[str, Any] = {"fc": face, "ec": line, "lw": width, "zorder": order} | look
+        artists.append(axes.add_artist(Polygon(points, **options)))
     return artists
 
 
@@ -118,57 +118,58 @@ def measure_scale(axes: Axes) -> float:
 def choose_numbers(
     vertices: Array, first: Sequence[int] = (), lowest: float = -math.inf
 ) -> dict[int, Array]:
-    """Choose which vertices of a polygon are numbered, and where the numbers stand.
+    """Positions of the numbers of vertices of a polygon, relative to each vertex, (2,).
 
-    All of them where there is room, or every second, fifth, tenth, ... one, and those of `first`
-    before others. A number stands inside, or outside of an object with up to 5 vertices, which may
-    be thin, and its middle at `lowest` or above. Vertices, (n, 2), and heights are in points.
-    Returned is where the middle of each number is, from its vertex, (2,); it turns with the object.
+    All vertices have one if there is room, or every second, fifth, tenth, ... one, and those of
+    `first` before others. A number is inside, or outside of an object with up to 5 vertices, which
+    may be thin, and its middle at `lowest` or above. Vertices, (n, 2), and heights are in points.
     """
     count = len(vertices)
     along = np.roll(vertices, -1, axis=0) - vertices
     along /= np.hypot(*along.T)[:, None]
     inwards = along - np.roll(along, 1, axis=0)
-    sharp = np.hypot(*inwards.T)  # 2 cos(half the angle at the vertex)
-    blunt = np.sqrt(np.maximum(1 - sharp**2 / 4, 1e-3))
-    shifts = (np.clip(5.5 / blunt, 8.5, 14.0) / sharp)[:, None] * inwards
+    sharpness = np.hypot(*inwards.T)  # 2 cos(half the angle at the vertex)
+    sine = np.sqrt(np.maximum(1 - sharpness**2 / 4, 1e-3))
+    shifts = (np.clip(5.5 / sine, 8.5, 14.0) / sharpness)[:, None] * inwards
 
-    def put(chosen: Iterable[int]) -> dict[int, Array]:
-        """Those of the chosen that stand clear of the ones before."""
+    def place_numbers(indices: Iterable[int]) -> dict[int, Array]:
+        """Positions of chosen vertices, without those that would overlap the ones before."""
         numbers: dict[int, Array] = {}
-        for index in chosen:
+        for index in indices:
             for shift in (shifts[index], -shifts[index])[: 1 + (count <= 5)]:
                 place = vertices[index] + shift
-                far = [
+                apart = [
                     np.abs(vertices[k] + other_shift - place)
                     > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))) + 0.3, 1.2])
                     for k, other_shift in numbers.items()
                 ]
-                if all(apart.any() for apart in far) and place[1] > lowest:
+                if all(axis.any() for axis in apart) and place[1] > lowest:
                     numbers[index] = shift
                     break
         return numbers
 
     steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
-    # None of them where even the first number would stand too low.
+    # Empty if even the first number would be too low.
     fitting = (
-        indices for step in steps if len(put(indices := range(0, count, step))) == len(indices)
+        indices
+        for step in steps
+        if len(place_numbers(indices := range(0, count, step))) == len(indices)
     )
-    every = next(fitting, range(0))
-    return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
+    chosen = next(fitting, range(0))
+    return dict(sorted(place_numbers(dict.fromkeys([*first, *chosen])).items()))
 
 
 def trace_link(finger: Finger, angle: float) -> Array:
     """Outline of a link, a capsule, shape (n, 2) [m]."""
     base, axis = np.asarray(finger.base), np.array([math.cos(angle), math.sin(angle)])
     half = np.linspace(angle - np.pi / 2, angle + np.pi / 2, 25)
-    turns = np.concatenate([half, np.pi + half])
+    angles = np.concatenate([half, np.pi + half])
     centres = np.repeat([base + finger.length * axis, base], len(half), axis=0)
-    return np.asarray(centres + finger.radius * np.column_stack([np.cos(turns), np.sin(turns)]))
+    return np.asarray(centres + finger.radius * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
 def choose_snapshots(trajectory: Trajectory) -> Numbers:
-    """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
+    """Rows of the trajectory to draw: phase boundaries and, if few, instants between them."""
     starts = trajectory.phase_starts
     parts = np.ones(len(starts) - 1, dtype=int)
     while parts.sum() + 1 < 6:
@@ -182,17 +183,17 @@ def choose_snapshots(trajectory: Trajectory) -> Numbers:
 
 
 class Strip(NamedTuple):
-    """Snapshots side by side, in as many rows as they need, all at one scale."""
+    """Layout of snapshots side by side, in one or more rows, all at one scale."""
 
     rows: tuple[tuple[int, ...], ...]  # samples of the trajectory, from left to right
-    boxes: dict[int, Array]  # (2, 2) [m]: lower left and upper right corner of what is seen at each
+    boxes: dict[int, Array]  # (2, 2) [m]: lower left and upper right corner of each picture
     low: float  # low, high [m]: lower and upper end of every picture
     high: float
     scale: float  # [in/m]
 
     @property
     def height(self) -> float:
-        """Of all rows with their captions and the bar above them [in]."""
+        """Height of all rows with their captions and the bar above them [in]."""
         return BAR + len(self.rows) * (self.scale * (self.high - self.low) + CAPTION)
 
 
@@ -201,21 +202,22 @@ def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool
 
     A caption needs 1.38 in, or 0.78 in a slim figure, on average.
     """
-    every, wide = choose_snapshots(trajectory), max(2, int(width / (0.78 if slim else 1.38)))
-    kept = np.linspace(0, len(every) - 1, min(len(every), 3 * wide)).round().astype(int)
+    columns = max(2, int(width / (0.78 if slim else 1.38)))
+    every = choose_snapshots(trajectory)
+    kept = np.linspace(0, len(every) - 1, min(len(every), 3 * columns)).round().astype(int)
     chosen = [int(row) for row in every[kept]]
-    lines = math.ceil(len(chosen) / wide)
+    lines = math.ceil(len(chosen) / columns)
     cuts = np.linspace(0, len(chosen), lines + 1).round().astype(int)
     rows = tuple(tuple(chosen[a:b]) for a, b in pairwise(cuts))
     pad = style.PALM * scene.scales.length * np.array([[-1.0], [1.0]])
     boxes = {row: measure_box(scene, trajectory.z[[row]]) + pad for row in chosen}
     low = min(float(box[0, 1]) for box in boxes.values())
     high = max(float(box[1, 1]) for box in boxes.values())
-    widest = [
+    scales = [
         (width - 0.12 * max(1, len(row) - 1)) / sum(np.ptp(boxes[k][:, 0]) for k in row)
         for row in rows
     ]
-    return Strip(rows, boxes, low, high, min(*widest, 1.75 / (high - low)))
+    return Strip(rows, boxes, low, high, min(*scales, 1.75 / (high - low)))
 
 
 def draw_strip(
@@ -225,7 +227,7 @@ def draw_strip(
     room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
     height = strip.scale * (strip.high - strip.low)
     form = fixed(min(trajectory.duration, 0.9))
-    # A bar of a round length, about a quarter of an inch long, gives the scale.
+    # The bar of the scale has a round length, about a quarter of an inch.
     power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
     length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
     ends, inches = [0.2, 0.2 + strip.scale * length], figure.dpi_scale_trans
@@ -242,7 +244,7 @@ def draw_strip(
             axes = style.inset(figure, left, bottom, width, height)
             box = np.column_stack([strip.boxes[k][:, 0], [strip.low, strip.high]])
             contacts = trajectory.motions[trajectory.phase[k]].contacts
-            # What does not press at this instant is left out, unless no force is known.
+            # Contacts that do not press at this instant are left out, unless no force is known.
             presses = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[k]), strict=True))
             names = [name for name in trajectory.contacts if name in contacts]
             names = [name for name in names if presses[name]] or names
@@ -255,26 +257,26 @@ def draw_strip(
 
 def measure_box(scene: Scene, z: Array) -> Array:
     """Corners of the box around hand and object at configurations, (n, 5); shape (2, 2) [m]."""
-    every = [*place_object(scene, z)]
+    shapes = [*place_object(scene, z)]
     for finger, angles in zip(scene.fingers, z[:, 3:].T, strict=True):
-        every += [trace_link(finger, angle) for angle in angles.tolist()]
-    points = np.concatenate(every)
+        shapes += [trace_link(finger, angle) for angle in angles.tolist()]
+    points = np.concatenate(shapes)
     return np.array([points.min(axis=0), points.max(axis=0)])
 
 
 def draw_margins(
-    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, more: ArrayLike = ()
+    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, further: ArrayLike = ()
 ) -> None:
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
     Lines are labelled with the names of contacts and broken where forces step. Contacts that never
-    press have none. The scale covers `more` margins [N], of any shape, too.
+    press have none. The scale covers `further` margins [N], of any shape, too.
     """
     steps, margins = trajectory.find_steps(), trajectory.c_n - epsilon
     t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
     for index in np.flatnonzero(np.isfinite(margins).any(axis=0)):
         name = trajectory.contacts[index]
-        # Where margins coincide the earlier, wider line stays visible beside the later one.
+        # If margins coincide, the earlier, wider line is visible beside the later one.
         rank = index / max(1, len(trajectory.contacts) - 1)
         colour, line, _ = styles[name]
         look: Any = {"color": colour, "linestyle": line, "linewidth": 3.4 - 2.0 * rank}
@@ -283,12 +285,12 @@ def draw_margins(
         values = np.insert(margins[:, index], np.repeat(steps, 2), ends)
         axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
-    scale_margins(axes, np.append(margins, more), epsilon)
+    scale_margins(axes, np.append(margins, further), epsilon)
 
 
 def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
-    # Where everything is at rest no force is known.
+    # At rest no force is known.
     largest, smallest = (float(f.reduce(margins, None, initial=0.0)) for f in (np.fmax, np.fmin))
     reach = max(largest, -smallest, 2 * epsilon) or 1.0
     linear = 10.0 ** (round(math.log10(reach)) - 2)
@@ -308,20 +310,20 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     decades = linear * 10.0 ** np.arange(math.ceil(math.log10(reach / linear)) + 1)
     points = 72 / axes.figure.dpi * axes.bbox.height / np.ptp(ends)
     for digits in ([1, 2, 5], [1]):
-        every = np.unique([0.0, linear / 2, *np.outer(digits, decades).flat])
-        every = np.concatenate([-every[:0:-1], every])
-        every = every[(every >= low) & (every <= high)]
-        # Where labels of 9 points would touch, powers of ten alone have one.
-        if points * np.diff(transform.transform(every)).min() >= 9:
+        ticks = np.unique([0.0, linear / 2, *np.outer(digits, decades).flat])
+        ticks = np.concatenate([-ticks[:0:-1], ticks])
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        # Only powers of ten have a label if labels of 9 points would overlap.
+        if points * np.diff(transform.transform(ticks)).min() >= 9:
             break
-    axes.yaxis.set_major_locator(FixedLocator(every.tolist()))
+    axes.yaxis.set_major_locator(FixedLocator(ticks.tolist()))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.grid(axis="y", color=style.GRID, linewidth=0.4)
     _scale_ticks(axes, factor)
 
 
 def _scale_ticks(axes: Axes, factor: float) -> None:
-    """Have the values at the ticks written times a factor."""
+    """Write the values at the ticks times a factor."""
     scaled = FuncFormatter(lambda y, _: f"{factor * y:.6g}".replace("-", "\u2212"))
     axes.yaxis.set_major_formatter(scaled)
 
@@ -332,13 +334,13 @@ def draw_cones(
     """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip."""
     fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
     mu = np.array([scene.friction.of(finger) for finger in fingers])
-    shares = trajectory.c_t / np.where(trajectory.rolling, mu * trajectory.c_n, np.nan)
+    ratios = trajectory.c_t / np.where(trajectory.rolling, mu * trajectory.c_n, np.nan)
     steps = trajectory.find_steps()
     t = np.insert(trajectory.t, steps, np.nan)
     for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
         name = trajectory.contacts[index]
         look: Any = {"color": styles[name].colour, "linestyle": styles[name].line, "zorder": 3}
-        values = np.insert(shares[:, index], steps, np.nan)
+        values = np.insert(ratios[:, index], steps, np.nan)
         axes.plot(t, values, linewidth=1.8, label=name, **look)
     for edge in (-1.0, 1.0):
         axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
@@ -354,7 +356,7 @@ def draw_cones(
 
 def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> None:
     """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m]."""
-    # Both ends of every piece, and between them as many places as show.
+    # Both ends of every piece, and enough places between them for a smooth curve.
     pieces, _, order = torque.coefficients.shape
     x = np.linspace(-1.0, 1.0, 2 if order <= 2 else max(order, math.ceil(2000 / pieces)))
     middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
@@ -400,8 +402,8 @@ def draw_simulation(margins: Axes, torques: Axes, simulation: Simulation, epsilo
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
     margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)[0].set_label("simulated")
-    other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
-    for index, look in enumerate((SIMULATED, SIMULATED | other)):
+    sparse = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
+    for index, look in enumerate((SIMULATED, SIMULATED | sparse)):
         label = f"simulated {index + 1}"
         torques.plot(t, simulation.tau[:, index], label=label, **look)
 
@@ -409,15 +411,15 @@ def draw_simulation(margins: Axes, torques: Axes, simulation: Simulation, epsilo
 def draw_phases(
     axes: Axes, starts: Array, *, labels: bool = True, span: float | None = None
 ) -> None:
-    """Shade every other phase and write each one's number above it, where there is room.
+    """Shade every other phase and write each one's number above it, if there is room.
 
-    Numbers of phases too short for them stand above the axes in two rows.
+    Numbers of phases that are too short for them are above the axes in two rows.
 
     `starts` are those of phases, and the last end, (n_phases + 1,) [s]; the axes cover `span` [s],
-    or the phases, and are at their final place, which decides what there is room for.
+    or the phases, and have their final size, on which the room depends.
     """
     points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
-    taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
+    row_ends = [-math.inf, -math.inf]  # where each row of numbers ends [points]
     for index, (start, end) in enumerate(pairwise(starts)):
         colour = "white" if index % 2 else style.BAND
         axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5)
@@ -425,10 +427,10 @@ def draw_phases(
         if 6.5 * len(text) >= points * (end - start):
             text = str(index + 1)
         half = 3.2 * len(text)
-        row = next((k for k, stop in enumerate(taken) if stop < middle - half), None)
+        row = next((k for k, stop in enumerate(row_ends) if stop < middle - half), None)
         if not labels or row is None:
             continue
-        taken[row] = middle + half
+        row_ends[row] = middle + half
         place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
         style.write(axes, text, place, (0, 4 + 10 * row), xycoords=units)
 
@@ -452,7 +454,7 @@ def force_margins(
     ----------
     what          planned, replayed or loaded; its `meta` must hold the problem's tables
     simulation    a replay of the same torques and contacts, drawn over it with dotted lines
-    width : [in]  of the figure, 3 to 40. Below 7 legends stand at the foot.
+    width : [in]  of the figure, 3 to 40. Below 7 legends are at the foot.
     motion        whether to draw the object's pose, and the joints' angles and speeds, too
 
     Axes are in the order: snapshots, margins, torques, cones, place, angles, joint speeds.
@@ -460,12 +462,12 @@ def force_margins(
     InputError if its `meta` lacks the problem, torques alone are given, or the width is out of its
     range.
     """
-    _, trajectory = narrow(what)
+    _, trajectory = split_torques(what)
     if trajectory is None:
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
     width = style.WIDTHS.read(width, "width")
     meta = trajectory.meta
-    problem = read_own_problem(meta)
+    problem = read_stored_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
     scene, styles = problem.scene, style.choose_styles(trajectory.contacts)
     parts = [textwrap.shorten(str(meta.get("name", "")), 36, placeholder="\u2026")]
@@ -473,9 +475,9 @@ def force_margins(
     parts.append(f"objective {objective}" if objective else str(meta.get("status", "")))
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
     if scene.fingers_collide:
-        least = find_finger_gap(scene, trajectory).least
-        # What is below 1 nm is a rounding error.
-        text = f"{round(1e3 * least, 6) + 0.0:.3g} mm" if least < 0.9995 else f"{least:.3g} m"
+        gap = find_finger_gap(scene, trajectory).least
+        # Gaps below 1 nm are rounding errors.
+        text = f"{round(1e3 * gap, 6) + 0.0:.3g} mm" if gap < 0.9995 else f"{gap:.3g} m"
         parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
     # From the foot of the figure to its title, in inches. A slim one has its legend at the foot.
     rolls, slim, line = bool(trajectory.rolling.any()), width < 7.0, 0.17
@@ -483,30 +485,30 @@ def force_margins(
     columns = max(1, int((width - 0.3) / 1.05))
     keys = len(trajectory.contacts) + 3 + 3 * motion + (simulation is not None)
     foot = 0.55 + (line * math.ceil(keys / columns) + 0.1 if slim else 0.0)
-    share = 0.65 if slim else 1.0
-    sizes = [1.2 * share] * 3 * motion + [1.75 * share] + [0.85] * rolls + [3.6 * share]
-    size_of_title, between = (8.5, " \u00b7 ") if slim else (10.5, "  \u00b7  ")
-    whole = between.join(part.replace(" ", "\u00a0") for part in parts if part)
-    longest = max(24, int(11.5 * width * 10.5 / size_of_title))
-    title = textwrap.wrap(whole, longest) + textwrap.wrap(str(meta.get("outcome", "")), longest)
-    left, gap = 0.8, 0.22
-    top = foot + sum(sizes) + gap * (len(sizes) - 1) + 0.3 + strip.height
+    scale = 0.65 if slim else 1.0
+    sizes = [1.2 * scale] * 3 * motion + [1.75 * scale] + [0.85] * rolls + [3.6 * scale]
+    size_of_title, separator = (8.5, " \u00b7 ") if slim else (10.5, "  \u00b7  ")
+    heading = separator.join(part.replace(" ", "\u00a0") for part in parts if part)
+    letters = max(24, int(11.5 * width * 10.5 / size_of_title))
+    title = textwrap.wrap(heading, letters) + textwrap.wrap(str(meta.get("outcome", "")), letters)
+    left, spacing = 0.8, 0.22
+    top = foot + sum(sizes) + spacing * (len(sizes) - 1) + 0.3 + strip.height
     with style.open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:
         draw_strip(figure, top, strip, trajectory, scene, styles)
-        wide, low, places = width - left - (0.12 if slim else 1.3), foot, []
+        panel_width, low, places = width - left - (0.12 if slim else 1.3), foot, []
         for size in sizes:
-            places.append((left, low, wide, size))
-            low += size + gap
+            places.append((left, low, panel_width, size))
+            low += size + spacing
         margins = style.inset(figure, *places[-1])
         torques, *others = (
             style.inset(figure, *place, sharex=margins)
             for place in [places[3 * motion], *places[-2:][:rolls], *places[2::-1][: 3 * motion]]
         )
         panels = [margins, torques, *others]
-        # Forces of a replay that ends at a step of the torques are those after it.
+        # Last forces of a replay that ends at a step of the torques are those after the step.
         last = getattr(what, "c_n", trajectory.c_n)[-1] - epsilon
-        more = last if simulation is None else np.append(simulation.c_n - epsilon, last)
-        draw_margins(margins, trajectory, epsilon, styles, more)
+        further = last if simulation is None else np.append(simulation.c_n - epsilon, last)
+        draw_margins(margins, trajectory, epsilon, styles, further)
         for k in np.flatnonzero(last < -epsilon):
             look: Any = {"color": styles[trajectory.contacts[k]].colour, "clip_on": False}
             margins.plot(trajectory.duration, last[k], "x", zorder=6, **look)
@@ -530,8 +532,8 @@ def force_margins(
                 axes.set_ylabel(f"{name} {style.unit_of(axes)}")
                 lines, labels = axes.get_legend_handles_labels()
                 legend |= zip(labels, lines, strict=True)
-            for own in [own for axes in others[-3:-1] * motion for own in axes.lines]:
-                legend.setdefault(str(own.get_label()), own)
+            for line_2d in [line_2d for axes in others[-3:-1] * motion for line_2d in axes.lines]:
+                legend.setdefault(str(line_2d.get_label()), line_2d)
             look = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
             look |= {"ncols": columns, "columnspacing": 1.0}
             figure.legend([*legend.values()], [*legend], **look)
@@ -550,7 +552,7 @@ def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180)
     Raises `InputError` if the ending is another one, or the file cannot be written.
     """
     ending = require_ending(path, *_FORMATS)
-    # What a device or a pipe gets is a PNG.
+    # A device or a pipe gets a PNG.
     kind = ending if ending in _FORMATS else ".png"
     options: Any = {"format": kind[1:], "metadata": _FORMATS[kind], "dpi": resolution}
     with matplotlib.rc_context(style.STYLE):

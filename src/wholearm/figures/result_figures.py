@@ -1,7 +1,7 @@
 """Figures of results: comparisons, predictions, studies of robustness, sweeps, searches.
 
 A sweep is a curve over one parameter, contours over two, small multiples beyond. Points without a
-plan have the colour of their reason. Nothing is interpolated but contour lines.
+plan have the colour of their reason. Only contour lines are interpolated.
 """
 
 from __future__ import annotations
@@ -38,59 +38,59 @@ if TYPE_CHECKING:
     from ..design.sensitivities import Sensitivities
     from ..design.sweep import Sweep
 
-MOST = 24  # panels, and lines of a panel
-SHARE = 0.08  # of the points of a panel, from which their reason is written there
-LEVELS = 8  # of contour lines at most, which are the ticks of the colour bar
+MOST = 24  # largest number of panels, and of lines of a panel
+LABELLED = 0.08  # least fraction of the points of a panel with which their reason is written
+LEVELS = 8  # largest number of contour lines, which are the ticks of the colour bar
 # White with a dark edge, to be seen on any colour.
 CONTOUR: Any = {"color": "white", "linewidth": 0.9}
 CONTOUR["path_effects"] = [withStroke(linewidth=1.9, foreground=style.INK)]
 Row = dict[str, Any]  # of a sweep
-Lines = Mapping[str, Sequence[Row]]  # rows by what they have in common
+Lines = Mapping[str, Sequence[Row]]  # rows by common values of other parameters
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (
     ("goal reached, contacts kept", style.PALETTE[2], "o"),
     ("goal reached, a contact lost", style.PALETTE[0], "s"),
     ("goal missed", style.PALETTE[6], "x"),
 )
-"""What becomes of a sample, its colour and its mark."""
+"""Outcomes of samples, with colour and mark."""
 
 
 @exclusive
 def draw_comparison(comparison: Comparison) -> Figure:
     """Draw c_n - epsilon of every contact over time: a panel for each plan, on one scale of time.
 
-    Replays are drawn; where nothing has moved a panel says so.
+    Replays are drawn. Those that have not moved have no panel, but their verdict.
     """
-    shown = [(contender, contender.replayed) for contender in comparison.contenders]
-    motions = [motion for _, motion in shown if motion is not None]
+    replays = [(contender, contender.replayed) for contender in comparison.contenders]
+    motions = [motion for _, motion in replays if motion is not None]
     names = dict.fromkeys(name for motion in motions for name in motion.contacts)
     styles = style.choose_styles(tuple(names))
     longest = max((motion.duration for motion in motions), default=1.0)
     # Height of a panel, and of a line of text above it, and room at both sides [in].
-    tall, line, left, right = 2.45, 0.25, 0.8, 1.3
-    high = 0.5 + len(motions) * (tall + line + 0.4) + len(shown) * line
-    covered = np.concatenate([[0.0], *(m.c_n.ravel() - comparison.epsilon for m in motions)])
-    with style.open_figure(10.0, high) as figure:
+    height, line, left, right = 2.45, 0.25, 0.8, 1.3
+    top = 0.5 + len(motions) * (height + line + 0.4) + len(replays) * line
+    all_margins = np.concatenate([[0.0], *(m.c_n.ravel() - comparison.epsilon for m in motions)])
+    with style.open_figure(10.0, top) as figure:
         title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
         style.write_title(figure, title)
         look: Any = {"fontsize": 9, "color": style.INK, "parse_math": False, "va": "bottom"}
         look["transform"] = figure.dpi_scale_trans
-        high -= 0.35
-        for contender, motion in shown:
-            high -= line
-            what = f"{contender.duration:.4g} s" if contender.ok else contender.reason
-            between = _DOT if contender.ok else ": "
-            heading = f"{contender.name}{_DOT}{contender.verdict}{between}{what}"
-            figure.text(left, high, heading, **look)
+        top -= 0.35
+        for contender, motion in replays:
+            top -= line
+            result = f"{contender.duration:.4g} s" if contender.ok else contender.reason
+            separator = _DOT if contender.ok else ": "
+            heading = f"{contender.name}{_DOT}{contender.verdict}{separator}{result}"
+            figure.text(left, top, heading, **look)
             if motion is None:
                 continue
-            high -= tall + line
-            axes = style.inset(figure, left, high, 10.0 - left - right, tall)
-            high -= 0.4
-            draw_margins(axes, motion, comparison.epsilon, styles, covered)
+            top -= height + line
+            axes = style.inset(figure, left, top, 10.0 - left - right, height)
+            top -= 0.4
+            draw_margins(axes, motion, comparison.epsilon, styles, all_margins)
             axes.set_xlim(0.0, longest)
             draw_phases(axes, motion.phase_starts, span=longest)
-            style.list_contacts(axes, 72 * tall)
+            style.list_contacts(axes, 72 * height)
             axes.set_ylabel(f"$c_n - \\varepsilon$ {style.unit_of(axes)}")
             axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
     return figure
@@ -102,15 +102,15 @@ def draw_prediction(prediction: Prediction) -> Figure:
     phases = [phase for phase in prediction.phases if phase.curves is not None]
     columns = min(3, max(len(phases), 2))
     rows = max(math.ceil(len(phases) / columns), 1)
-    # Size of a panel with what is written about it, and the room that this takes [in].
-    (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
+    # Size of a panel with texts and margins, and these margins [in].
+    (width, height), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
     scales = [_measure_force(phase, prediction.epsilon) for phase in phases]
     prefix, factor = style.choose_prefix(2.2 * max(scales, default=prediction.epsilon))
-    with style.open_figure(columns * wide, rows * tall + 0.45) as figure:
+    with style.open_figure(columns * width, rows * height + 0.45) as figure:
         for k, phase in enumerate(phases):
             row, column = divmod(k, columns)
-            corner = column * wide + left, (rows - 1 - row) * tall + bottom
-            axes = style.inset(figure, *corner, wide - left - right, tall - bottom - top)
+            corner = column * width + left, (rows - 1 - row) * height + bottom
+            axes = style.inset(figure, *corner, width - left - right, height - bottom - top)
             _draw_phase(axes, phase, prediction.epsilon)
             axes.yaxis.set_major_formatter(FuncFormatter(lambda force, _: f"{factor * force:g}"))
             axes.set_ylabel(f"least $c_n$ [{prefix}N]" if column == 0 else "")
@@ -124,18 +124,18 @@ def _measure_force(phase: PhasePrediction, epsilon: float) -> float:
     """The largest of the forces at the least speeds that motions have [N], at least epsilon."""
     assert phase.curves is not None
     forces = phase.curves.force.values()
-    return max([epsilon, *(float(known[0]) for f in forces if len(known := f[np.isfinite(f)]))])
+    return max([epsilon, *(float(finite[0]) for f in forces if len(finite := f[np.isfinite(f)]))])
 
 
 def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
-    """The lines of one phase, with where they break, and above them what breaks."""
+    """Curves of one phase with their limit speeds, and above them the limits that are violated."""
     curves = phase.curves
     assert curves is not None
     low, high = _measure_force(phase, epsilon) * np.array([-0.35, 2.2])
     axes.axhspan(0.0, epsilon, color=style.LOW, linewidth=0, zorder=1)
     axes.axhspan(low, 0.0, color=style.LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
-    above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom"}
+    caption: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom"}
     for k, survival in enumerate(phase.survivals):
         colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
         look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
@@ -148,17 +148,17 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
         failure = f"{speed}: {survival.first.name}"
         failure = "keeps \u03b5 at any speed" if survival.speed is None else failure
         text = f"{survival.motion}, {failure}"
-        above["fontsize"] = 7.5 * min(1.0, 54 / len(text))  # to be no wider than the panel
-        style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **above)
+        caption["fontsize"] = 7.5 * min(1.0, 54 / len(text))  # to be no wider than the panel
+        style.write(axes, text, (0, 1), (0, 29 - 12 * k), color=colour, **caption)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
         axes.text(0.5, 0.8, "no slow motion keeps its limits", color=style.INK, **middle)
     title = f"phase {phase.number}, until {phase.until}"
-    above |= {"fontsize": 9 * min(1.0, 38 / len(title)), "fontweight": "bold"}
-    style.write(axes, title, (0, 1), (0, 41), color=style.INK, **above)
+    caption |= {"fontsize": 9 * min(1.0, 38 / len(title)), "fontweight": "bold"}
+    style.write(axes, title, (0, 1), (0, 41), color=style.INK, **caption)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
-    wide = curves.speed[-1] > 20.0 * curves.speed[0]
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if wide else (1.0, 2.0, 3.0, 5.0)))
+    long = curves.speed[-1] > 20.0 * curves.speed[0]
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if long else (1.0, 2.0, 3.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -180,7 +180,7 @@ def draw_robustness(study: Robustness) -> Figure:
 
 
 def find_kind(record: dict[str, Any]) -> int:
-    """Index of what has become of a sample: kept, reached, missed."""
+    """Index of the outcome of a sample: kept, reached, missed."""
     return 0 if record["reached"] and record["kept"] else 1 if record["reached"] else 2
 
 
@@ -206,8 +206,8 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
     axes.plot(*(1e3 * nominal[:, :2].T), color=style.INK, linewidth=1.6, zorder=4)
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    deep = 1e3 * style.PALM * scene.scales.length
-    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=style.INK, lw=0, zorder=1))
+    depth = 1e3 * style.PALM * scene.scales.length
+    axes.add_patch(Rectangle((left, -depth), right - left, depth, fc=style.INK, lw=0, zorder=1))
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
 
@@ -217,65 +217,65 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     uncertainty, scene = study.trial.uncertainty, study.trial.problem.scene
     goal = 1e3 * uncertainty.find_distance(scene), math.degrees(uncertainty.angle)
     deviations = [(1e3 * record["distance"], math.degrees(record["angle"])) for record in records]
-    least = 1e-4  # [mm] and [deg]: lesser ones are drawn so
-    places = np.maximum(np.array(deviations).reshape(-1, 2), least)
+    floor = 1e-4  # [mm] and [deg]: lesser ones are drawn so
+    places = np.maximum(np.array(deviations).reshape(-1, 2), floor)
     kinds = np.array([find_kind(record) for record in records])
     for kind, (label, colour, marker) in enumerate(_KINDS):
         points = places[kinds == kind]
         text = f"{label}: {len(points)} of {len(study.records)}"
         axes.plot(*points.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     axes.set(xscale="log", yscale="log")
-    around = np.vstack([places, goal])
+    points_all = np.vstack([places, goal])
     # Whole powers of ten, so that both ends of an axis have a number.
-    low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
-    high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
+    low = 0.8 * 10 ** np.floor(np.log10(points_all.min(axis=0)))
+    high = 1.25 * 10 ** np.ceil(np.log10(points_all.max(axis=0)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    notes = [f" (at least {least:g})" * (min(column) <= least) for column in around.T.tolist()]
+    notes = [f" (at least {floor:g})" * (min(column) <= floor) for column in points_all.T.tolist()]
     axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=style.INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8)
-    beyond = len(study.records) - len(records)
-    title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
+    absent = len(study.records) - len(records)
+    title = f"ends of {len(records)} samples" + (f"; {absent} never started" if absent else "")
     axes.set_title(title, fontsize=9)
 
 
 def choose_axes(
     vary: Mapping[str, Sequence[Any]], samples: int, problems: int
 ) -> tuple[list[str], list[str]]:
-    """Names of the parameters that are axes, and of those that lines or panels are for.
+    """Names of the parameters on axes, and of those with one line or panel for each value.
 
     InputError if a grid has more than three parameters, or there are too many panels.
     """
-    several = [name for name, values in vary.items() if len(values) > 1]
-    numeric = [k for k in several if all(type(v) in (int, float) for v in vary[k])]
+    varied = [name for name, values in vary.items() if len(values) > 1]
+    numeric = [k for k in varied if all(type(v) in (int, float) for v in vary[k])]
     if not numeric or (len(numeric) > 3 and not samples):
         text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
         raise InputError("", "--figure", f"{text}; --samples may have any number")
-    shown = numeric if samples else numeric[:2]
-    fixed = [] if samples else [name for name in several if name not in shown]
-    if max(len(shown), problems * math.prod(len(vary[name]) for name in fixed)) > MOST:
+    axes = numeric if samples else numeric[:2]
+    fixed = [] if samples else [name for name in varied if name not in axes]
+    if max(len(axes), problems * math.prod(len(vary[name]) for name in fixed)) > MOST:
         raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
-    return shown, fixed
+    return axes, fixed
 
 
 def draw_sweep(sweep: Sweep) -> Figure:
-    """Draw the values over the parameters, and why there are none where there are none.
+    """Draw the values over the parameters, and the reasons of missing ones.
 
     Over one parameter, problems and words are lines; over two they are panels. Samples have a panel
     for each parameter.
 
     InputError as `choose_axes`.
     """
-    shown, fixed = choose_axes(sweep.vary, sweep.samples, len(sweep.problems))
+    names, fixed = choose_axes(sweep.vary, sweep.samples, len(sweep.problems))
     lines = dict[str, list[Row]]()
     for row in sweep.rows:
         parts = [row["problem"]] if len(sweep.problems) > 1 else []
         parts += [f"{name} = {show(row[name], '.6g')}" for name in fixed]
         lines.setdefault(", ".join(parts), []).append(row)
-    contours = len(shown) == 2 and not sweep.samples
-    panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
+    contours = len(names) == 2 and not sweep.samples
+    panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in names]
     reasons = sweep.reasons
     crosses = not contours and (len(lines) > 1 or sweep.samples > 0)
     # Crosses have other colours than the curves beside them.
@@ -289,10 +289,10 @@ def draw_sweep(sweep: Sweep) -> Figure:
             if contours:
                 ((title, rows),) = panel.items()
                 axes.set_title(title, fontsize=9, parse_math=False)
-                mesh = _draw_plane(axes, sweep, shown, rows, colours)
+                mesh = _draw_plane(axes, sweep, names, rows, colours)
             else:
-                _draw_lines(axes, sweep, shown[k], panel, colours)
-            # So many labels, of so few digits, have room side by side.
+                _draw_lines(axes, sweep, names[k], panel, colours)
+            # Few labels with few digits do not overlap.
             axes.locator_params(axis="x", nbins=6)
             axes.ticklabel_format(axis="x", scilimits=(-2, 4))
         for axes in grid.flat[len(panels) :]:
@@ -300,12 +300,12 @@ def draw_sweep(sweep: Sweep) -> Figure:
         if contours:
             look: Any = {"label": sweep.label, "ticks": MaxNLocator(LEVELS)}
             bar = figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), **look)
-            drawn = [each for axes in grid.flat for each in axes.findobj(ContourSet)]
-            if any(len(line) for each in drawn for line in each.get_paths()):
+            contours_drawn = [contour for axes in grid.flat for contour in axes.findobj(ContourSet)]
+            if any(len(line) for contour in contours_drawn for line in contour.get_paths()):
                 bar.ax.grid(axis="y", **CONTOUR)
         keys = list[Line2D]()
         for reason, count in [*reasons.items()][:8]:
-            look = {"color": colours[reason] if crosses else _pale(colours[reason])}
+            look = {"color": colours[reason] if crosses else _lighten(colours[reason])}
             look |= {"marker": "sx"[crosses], "label": fill(f"{reason}: {count}", 110)}
             keys.append(Line2D([], [], linestyle="", **look))
         if keys:
@@ -315,24 +315,24 @@ def draw_sweep(sweep: Sweep) -> Figure:
     return figure
 
 
-def _pale(colour: str) -> tuple[float, float, float]:
+def _lighten(colour: str) -> tuple[float, float, float]:
     red, green, blue = (0.7 + 0.3 * int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
     return red, green, blue
 
 
-def _take(rows: Sequence[Row]) -> tuple[Array, list[str]]:
+def _values(rows: Sequence[Row]) -> tuple[Array, list[str]]:
     """Values of rows, NaN without a plan, and reasons, empty with a plan."""
     values = np.array([row["value"] for row in rows], dtype=float)
     return values, [row.get("reason", "") for row in rows]
 
 
-def _border(places: Array) -> Array:
+def _cell_edges(places: Array) -> Array:
     """Borders of cells around places, half way between them."""
     return np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
 
 
 def _write(axes: Axes, reason: str, colour: str, x: float, y: float, transform: Any) -> None:
-    box = {"facecolor": _pale(colour), "linewidth": 0, "pad": 1.5}
+    box = {"facecolor": _lighten(colour), "linewidth": 0, "pad": 1.5}
     look: Any = {"ha": "center", "va": "center", "fontsize": 7.5, "color": style.INK, "bbox": box}
     text = fill(reason if len(reason) <= 60 else f"{reason[:57]}...", 18)
     axes.text(x, y, text, transform=transform, parse_math=False, **look)
@@ -343,36 +343,36 @@ def _draw_lines(
 ) -> None:
     """Values over one parameter.
 
-    Where a curve alone has no value, there is a band in the colour of the reason. Several lines,
-    and samples, have a row of crosses each, in a band below all values.
+    A single curve has bands in the colour of the reason where it has no value. Several lines, and
+    samples, have a row of crosses each, in a band below all values.
     """
     axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
     axes.grid(color=style.GRID, linewidth=0.4)
-    single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
-    tall = min(0.05, 0.4 / len(lines))  # height of a row of crosses, over that of the axes
+    single, transform = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
+    height = min(0.05, 0.4 / len(lines))  # height of a row of crosses, over that of the axes
     for number, (label, rows) in enumerate(lines.items()):
         rows = sorted(rows, key=lambda row: row[name])
         x = np.array([row[name] for row in rows], dtype=float)
-        (values, reasons), (dash, marker) = _take(rows), style.LINES[number % len(style.LINES)]
+        (values, reasons), (dash, marker) = _values(rows), style.LINES[number % len(style.LINES)]
         look: Any = {"color": style.PALETTE[number % len(style.PALETTE)], "marker": marker, "ms": 3}
         axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
-        strip, borders, first = tall * (number + 0.5), _border(x), 0
+        height_of_row, borders, first = height * (number + 0.5), _cell_edges(x), 0
         if len(lines) > 1 and any(reasons):
-            axes.plot(-0.02, strip, transform=axes.transAxes, clip_on=False, **look)
+            axes.plot(-0.02, height_of_row, transform=axes.transAxes, clip_on=False, **look)
         for reason, group in groupby(reasons):
             last = first + len(list(group))
             left, right, colour = borders[first], borders[last], colours.get(reason, "")
             if reason and single:
-                axes.axvspan(left, right, color=_pale(colour), linewidth=0, zorder=1)
-                if last - first > SHARE * len(rows):
-                    _write(axes, reason, colour, (left + right) / 2, 0.5, across)
+                axes.axvspan(left, right, color=_lighten(colour), linewidth=0, zorder=1)
+                if last - first > LABELLED * len(rows):
+                    _write(axes, reason, colour, (left + right) / 2, 0.5, transform)
             elif reason:
-                places = np.full(last - first, strip)
-                axes.plot(x[first:last], places, "x", color=colour, transform=across)
+                places = np.full(last - first, height_of_row)
+                axes.plot(x[first:last], places, "x", color=colour, transform=transform)
             first = last
     if not single and sweep.reasons:
         bottom, top = axes.get_ylim()
-        low = top - (top - bottom) / (1 - tall * len(lines))
+        low = top - (top - bottom) / (1 - height * len(lines))
         axes.set(yticks=[y for y in axes.get_yticks() if bottom <= y <= top], ylim=(low, top))
         axes.axhspan(low, bottom, color=style.BAND, linewidth=0, zorder=1)
     if len(lines) > 1:
@@ -380,51 +380,51 @@ def _draw_lines(
 
 
 def _draw_plane(
-    axes: Axes, sweep: Sweep, shown: Sequence[str], rows: Sequence[Row], colours: Mapping[str, str]
+    axes: Axes, sweep: Sweep, names: Sequence[str], rows: Sequence[Row], colours: Mapping[str, str]
 ) -> Any:
     """Values over two parameters as cells, with contour lines, and regions without a plan."""
-    axes.set(xlabel=sweep.titles[shown[0]], ylabel=sweep.titles[shown[1]])
-    x, y = (np.sort(np.array(sweep.vary[name], dtype=float)) for name in shown)
-    values, reasons = _take(sorted(rows, key=lambda row: [row[name] for name in shown]))
-    values, every = values.reshape(len(x), len(y)).T, _take(sweep.rows)[0]
-    low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
+    axes.set(xlabel=sweep.titles[names[0]], ylabel=sweep.titles[names[1]])
+    x, y = (np.sort(np.array(sweep.vary[name], dtype=float)) for name in names)
+    values, reasons = _values(sorted(rows, key=lambda row: [row[name] for name in names]))
+    values, all_values = values.reshape(len(x), len(y)).T, _values(sweep.rows)[0]
+    low, high = (np.nanmin(all_values), np.nanmax(all_values)) if sweep.ok else (0.0, 1.0)
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
-    borders = _border(x), _border(y)
+    borders = _cell_edges(x), _cell_edges(y)
     mesh = axes.pcolormesh(*borders, values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
-        levels, known = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
-        axes.contour(x, y, known, levels).set(**CONTOUR)
-    shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
+        levels, masked = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
+        axes.contour(x, y, masked, levels).set(**CONTOUR)
+    shades, reason_grid = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():
-        here = names == reason
-        shades[here] = *_pale(colour), 1.0
-        if here.mean() > SHARE and here.any(axis=0).mean() > 0.35:  # wide enough
-            below, left = np.nonzero(here)
-            # Cells at the edges are halves: their middles are not at the values.
-            across, up = (
-                (each[at] + each[at + 1]).mean() / 2
-                for each, at in zip(borders, (left, below), strict=True)
+        mask = reason_grid == reason
+        shades[mask] = *_lighten(colour), 1.0
+        if mask.mean() > LABELLED and mask.any(axis=0).mean() > 0.35:  # wide enough
+            below, left = np.nonzero(mask)
+            # Cells at the edges are halves: their middles differ from the values.
+            x_mid, y_mid = (
+                (edges[k] + edges[k + 1]).mean() / 2
+                for edges, k in zip(borders, (left, below), strict=True)
             )
-            _write(axes, reason, colour, across, up, axes.transData)
+            _write(axes, reason, colour, x_mid, y_mid, axes.transData)
     axes.pcolormesh(*borders, shades)
     return mesh
 
 
 @exclusive
 def draw_sensitivities(result: Sensitivities) -> Figure:
-    """Draw what 1 % more of each number changes, part by part of the plan, the largest first."""
+    """Draw the effects of 1 % more of each number, by parts of the plan, the largest first."""
     rows = [row for row in result.rows if row.percent]
     titles, count = [f"{row.name} = {row.given:.4g} {row.unit}" for row in rows], range(len(rows))
-    high, left = 0.24 * len(rows), 0.4 + 0.075 * max(map(len, titles), default=0)
-    with style.open_figure(style.WIDTH, high + 1.1) as figure:
-        axes = style.inset(figure, left, 0.6, style.WIDTH - left - 2.2, high)
+    height, left = 0.24 * len(rows), 0.4 + 0.075 * max(map(len, titles), default=0)
+    with style.open_figure(style.WIDTH, height + 1.1) as figure:
+        axes = style.inset(figure, left, 0.6, style.WIDTH - left - 2.2, height)
         # Lines at the outermost ends of bars need a margin, which bars without a width take away.
         axes.use_sticky_edges = False
-        worth = 0.01 * np.array([[row.given * slope for slope in row.phases] for row in rows])
-        for k, (part, bars) in enumerate(zip(result.parts, worth.T, strict=True)):
-            before = np.where(worth[:, :k] * bars[:, None] > 0, worth[:, :k], 0.0).sum(axis=1)
+        effects = 0.01 * np.array([[row.given * slope for slope in row.phases] for row in rows])
+        for k, (part, bars) in enumerate(zip(result.parts, effects.T, strict=True)):
+            offsets = np.where(effects[:, :k] * bars[:, None] > 0, effects[:, :k], 0.0).sum(axis=1)
             colour = style.PALETTE[k % len(style.PALETTE)]
-            axes.barh(count, bars, 0.7, before, color=colour, label=f"phase {part}")
+            axes.barh(count, bars, 0.7, offsets, color=colour, label=f"phase {part}")
         axes.barh(count, 0.0, 0.84, [row.percent for row in rows], edgecolor=style.INK, lw=1.6)
         for k, row in enumerate(rows):
             text = row.limit + " (one-sided)" * bool(row.note)
@@ -440,35 +440,35 @@ def draw_sensitivities(result: Sensitivities) -> Figure:
 
 @exclusive
 def draw_search(result: Design) -> Figure:
-    """Draw what is minimised and the numbers of all hands tried, with lines for the best so far."""
-    choices, wide = result.aim.choices, style.WIDTH - 3.4
+    """Draw costs and numbers of all evaluated hands, with lines for the best so far."""
+    choices, width = result.aim.choices, style.WIDTH - 3.4
     with style.open_figure(style.WIDTH, 3.1 + len(choices)) as figure:
         tall = float(figure.get_size_inches()[1])
-        first = style.inset(figure, 1.2, tall - 2.4, wide, 2.0)
-        others = [style.inset(figure, 1.2, tall - 3.4 - k, wide, 0.8) for k in range(len(choices))]
+        first = style.inset(figure, 1.2, tall - 2.4, width, 2.0)
+        others = [style.inset(figure, 1.2, tall - 3.4 - k, width, 0.8) for k in range(len(choices))]
         starts = sorted({hand.start for hand in result.hands})
-        # Some far worse hands are on the upper edge.
-        good = [hand.cost for hand in result.hands if not hand.reason]
-        low, high = np.quantile(good, [0.0, 0.95], method="higher")
+        # Hands with much larger costs are drawn on the upper edge.
+        costs_of_plans = [hand.cost for hand in result.hands if not hand.reason]
+        low, high = np.quantile(costs_of_plans, [0.0, 0.95], method="higher")
         low, high = low - 0.1 * (high - low) - 1e-9, high + 0.05 * (high - low)
         for start, colour in zip(starts, style.PALETTE * len(starts), strict=False):
             hands = [hand for hand in result.hands if hand.start == start]
             costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
-            best, none = np.fmin.accumulate(costs), number[np.isnan(costs)]
-            # The best hand so far. All is NaN of hands without a plan.
+            best, failed = np.fmin.accumulate(costs), number[np.isnan(costs)]
+            # The best hand so far. Values of hands without a plan are NaN.
             leader = np.maximum.accumulate(np.where(costs <= best, number - 1, 0))
             values = np.array([result.aim.find(hand) for hand in hands]).T + 0 * costs
             columns, label = [np.minimum(costs, high), *values], f"start {start}"
             for axes, column in zip([first, *others], columns, strict=True):
                 axes.plot(number, column, ".", color=colour, alpha=0.4, clip_on=False)
                 axes.step(number, column[leader], color=colour, where="post", label=label)
-            across = first.get_xaxis_transform()
-            first.plot(none, 0 * none + 0.03, "x", color=colour, transform=across)
+            transform = first.get_xaxis_transform()
+            first.plot(failed, 0 * failed + 0.03, "x", color=colour, transform=transform)
         first.set(ylim=(low, high), ylabel=result.label)
         first.legend(bbox_to_anchor=(1.01, 1.0), loc="upper left")
         for axes, choice in zip(others, choices, strict=True):
-            room = 0.05 * (choice.high - choice.low)
-            axes.set_ylim(choice.low - room, choice.high + room)
+            pad = 0.05 * (choice.high - choice.low)
+            axes.set_ylim(choice.low - pad, choice.high + pad)
             title = choice.parameter.title
             axes.text(1.02, 0.5, title, transform=axes.transAxes, va="center")
         for axes in (first, *others):

@@ -1,4 +1,4 @@
-"""How figures look: sizes, colours, lines and text."""
+"""Style of figures: sizes, colours, lines and text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH = 10.0  # width of a figure, unless another one is asked for [in]
+WIDTH = 10.0  # default width of a figure [in]
 WIDTHS = Range(3.0, 40.0)  # least and largest width [in]
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (
@@ -39,7 +39,7 @@ PALM = 0.12  # thickness of the palm, over the object's radius of gyration
 
 
 class ContactStyle(NamedTuple):
-    """How one contact is drawn: alike in the snapshots and over time."""
+    """Style of one contact, in the snapshots and over time."""
 
     colour: str
     line: Any
@@ -51,7 +51,7 @@ Styles = Mapping[str, ContactStyle]
 
 @contextmanager
 def open_figure(width: float, height: float, **options: Any) -> Iterator[Figure]:
-    """A figure of so many inches, to be drawn in the style of all."""
+    """A figure with a size in inches, and the common style while it is open."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -71,7 +71,7 @@ def inset(
 
 
 def add_line(axes: Axes, points: Array, **look: Any) -> Artist:
-    """Draw a line through points, shape (n, 2), that leaves the limits of the axes as they are."""
+    """Draw a line through points, shape (n, 2), without a change of the limits of the axes."""
     from matplotlib.lines import Line2D
 
     return axes.add_artist(Line2D(*points.T, **look))
@@ -90,7 +90,7 @@ def unit_of(axes: Axes) -> str:
 
 
 def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
-    """Write the legend of axes to their right, in so small letters that `room` [points] do."""
+    """Write the legend of axes to their right, with letters that fit a height `room` [points]."""
     keys = axes.get_legend_handles_labels()
     count = max(len(keys[1]), 1)
     size = min(largest, room / (1.1 * count))

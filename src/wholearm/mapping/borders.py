@@ -5,11 +5,11 @@ With the vertex v_p on the palm, y is a function of phi, and every border is an 
 * an edge flush on the palm: phi is the edge's flush angle;
 * edge j flush on a link: the joint is `radius` outside the edge's line, linear in x;
 * a vertex passing from the side of a link to its tip: abs(p - base)^2 = length^2 + radius^2;
-* a vertex on the tip giving way to an edge: abs(p + radius m - base) = length, m the edge's outward
-  normal. With a pointed tip this and the one before coincide: the tip is at the vertex.
+* the tip passing from a vertex to an edge: abs(p + radius m - base) = length, m the edge's outward
+  normal. With a pointed tip this curve and the one before coincide: the tip is at the vertex.
 
-Each curve is sampled, every sample is labelled with what touches there, and the places where the
-label changes are found by bisection. What is left are the pieces that are borders indeed.
+Each curve is sampled, the samples are labelled with the touching contacts, and changes of the label
+are found by multisection. Pieces with a valid label are borders.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from ..contacts.closing import ClosedFinger, close_fingers, first_contact, lower
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
-PARTS = 16  # of an interval in which a change of labels is looked for
+PARTS = 16  # parts of an interval in a step of the multisection
 LONGEST = 0.06  # longest step in x between points of a border, in radii of gyration
-NOWHERE = -1  # fills the labels of places that are no border
+NOWHERE = -1  # label of places that are no border
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The part of the plane that is looked at: `x` in m and `phi` in rad, low and high."""
+    """A part of the (x, phi) plane: low and high of `x` [m] and `phi` [rad]."""
 
     x: tuple[float, float]
     phi: tuple[float, float]
 
     def bands(self, scene: Scene) -> list[tuple[float, float, int]]:
-        """Ranges of phi in which one vertex is on the palm: low, high, vertex."""
+        """Ranges of phi with one vertex on the palm: low, high, vertex."""
         ends = [self.phi[0], *(phi for phi, _ in self.flush_angles(scene)), self.phi[1]]
         middles = np.array([(a + b) / 2 for a, b in pairwise(ends)])
         vertices = lower(scene, middles)[1]
@@ -51,10 +51,10 @@ class Window:
         angles = []
         for edge in range(scene.polygon.n_vertices):
             angle = scene.polygon.flush_angle(edge)
-            turns = np.arange(np.ceil((self.phi[0] - angle) / (2 * np.pi)), 1e3)
-            within = angle + 2 * np.pi * turns
-            within = within[(within > self.phi[0]) & (within < self.phi[1])]
-            angles += [(float(value), edge) for value in within]
+            counts = np.arange(np.ceil((self.phi[0] - angle) / (2 * np.pi)), 1e3)
+            inside = angle + 2 * np.pi * counts
+            inside = inside[(inside > self.phi[0]) & (inside < self.phi[1])]
+            angles += [(float(value), edge) for value in inside]
         return sorted(angles)
 
 
@@ -62,19 +62,19 @@ class Window:
 class Track:
     """A curve in the (x, phi) plane on which a border may lie."""
 
-    # parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none
+    # parameter of shape (n,) to (x, phi), each of shape (n,), NaN if there is none
     pose: Callable[[Array], tuple[Array, Array]]
     # (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each of
-    # palm, finger 1 and finger 2; `NOWHERE` for a second one that is missing, or for no border
+    # palm, finger 1 and finger 2; `NOWHERE` for a missing second one, or if there is no border
     label: Callable[[Array, Array, ClosedFinger], Numbers]
     places: Array  # (n,): parameters to sample at, increasing
-    # the finger (None for the palm) and its flush edge; None where a contact changes its name
+    # the finger (None for the palm) and its flush edge; None if a contact changes its name
     flush: tuple[int | None, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A stretch of a track with one set of contacts."""
+    """A part of a track with one set of contacts."""
 
     track: Track
     places: Array  # (n,): parameters of its points, increasing, ends included
@@ -82,7 +82,7 @@ class Piece:
 
 
 def label_cells(scene: Scene, poses: Array) -> Numbers:
-    """What touches at poses (x, phi) inside cells, shape (..., 3); `NOWHERE` out of reach."""
+    """Labels at poses (x, phi) inside cells, shape (..., 3); `NOWHERE` if the hand cannot close."""
     labels = label_inside(scene, close_fingers(scene, *poses.reshape(-1, 2).T))
     return labels[:, [0, 2, 4]].reshape(*poses.shape[:-1], 3)
 
@@ -96,13 +96,13 @@ def label_closed(closed: ClosedFinger, vertex: int | Numbers) -> Numbers:
     """Labels of closed poses with `vertex` on the palm, shape (n, 6)."""
     labels = np.full((len(closed.z), 6), NOWHERE)
     labels[:, 0] = vertex
-    labels[:, [2, 4]] = closed.touched
+    labels[:, [2, 4]] = closed.contacts
     labels[(closed.obstacle != 0).any(axis=1)] = NOWHERE
     return labels
 
 
 def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
-    """Every curve of the window on which a border may lie, about `samples` places across it."""
+    """All curves of the window on which a border may lie, with about `samples` places each."""
     for phi, edge in window.flush_angles(scene):
         yield palm_track(scene, edge, phi, np.linspace(*window.x, samples))
     height = window.phi[1] - window.phi[0]
@@ -118,14 +118,14 @@ def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
 
 def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
     """The line on which `edge` lies flush on the palm, by x [m]."""
-    after = (edge + 1) % scene.polygon.n_vertices
+    next_vertex = (edge + 1) % scene.polygon.n_vertices
 
     def pose(x: Array) -> tuple[Array, Array]:
         return x, np.full_like(x, phi)
 
     def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         labels = label_closed(closed, edge)
-        labels[labels[:, 0] != NOWHERE, 1] = after
+        labels[labels[:, 0] != NOWHERE, 1] = next_vertex
         return labels
 
     return Track(pose, label, places, (None, edge))
@@ -142,20 +142,20 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
     def pose(phi: Array) -> tuple[Array, Array]:
         (corner,), m = _corners_at(scene, phi, vertex, edge), _outward(scene, edge, phi)
         with np.errstate(divide="ignore", invalid="ignore"):
-            across = (link.radius - m[:, 1] * (base[1] - corner[:, 1])) / m[:, 0]
-        return base[0] - corner[:, 0] - across, phi
+            offset = (link.radius - m[:, 1] * (base[1] - corner[:, 1])) / m[:, 0]
+        return base[0] - corner[:, 0] - offset, phi
 
     def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         corners, m = _corners_at(scene, phi, vertex, near, far), _outward(scene, edge, phi)
         corners[..., 0] += x
         axis = (1.0 if finger == 0 else -1.0) * np.column_stack([-m[:, 1], m[:, 0]])
-        near_run, far_run = ((corners - base) * axis).sum(axis=2)
-        within = (near_run > 0) & (near_run <= link.length)
+        near_position, far_position = ((corners - base) * axis).sum(axis=2)
+        possible = (near_position > 0) & (near_position <= link.length)
         # The edge lies on the link up to its far vertex or up to the tip.
         ends = [first + edge, first + after], [first + near, first + count + edge]
-        pair = np.where((far_run <= link.length)[:, None], *ends)
+        pair = np.where((far_position <= link.length)[:, None], *ends)
         angle = np.arctan2(axis[:, 1], axis[:, 0])
-        return _label_pair(closed, vertex, finger, angle, pair, within)
+        return _label_pair(closed, vertex, finger, angle, pair, possible)
 
     return Track(pose, label, places, (finger, edge))
 
@@ -177,18 +177,18 @@ def _circle_track(
 
     def centre(phi: Array) -> Array:
         (corner,) = _corners_at(scene, phi, vertex, index)
-        apart = 0.0 if edge is None else link.radius * _outward(scene, edge, phi)
-        return np.asarray(corner + apart)
+        offset = 0.0 if edge is None else link.radius * _outward(scene, edge, phi)
+        return np.asarray(corner + offset)
 
     def pose(phi: Array) -> tuple[Array, Array]:
-        place = centre(phi)
+        position = centre(phi)
         with np.errstate(invalid="ignore"):
-            across = np.sqrt(distance**2 - (place[:, 1] - base[1]) ** 2)
-        return base[0] - place[:, 0] + branch * across, phi
+            half_chord = np.sqrt(distance**2 - (position[:, 1] - base[1]) ** 2)
+        return base[0] - position[:, 0] + branch * half_chord, phi
 
     def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
-        place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
-        angle = np.arctan2(place[:, 1], place[:, 0])
+        position = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
+        angle = np.arctan2(position[:, 1], position[:, 0])
         sign = 1.0 if finger == 0 else -1.0
         if edge is None:
             angle = angle - sign * np.arctan2(link.radius, link.length)
@@ -196,8 +196,8 @@ def _circle_track(
             # All vertices are on one side of a line through a vertex if its neighbours are.
             neighbours = (index - 1) % count, (index + 1) % count
             corner, *others = _corners_at(scene, phi, vertex, index, *neighbours)
-            away = [((other - corner) * inwards).sum(axis=1) for other in others]
-            supported = np.minimum(*away) > -3e-11 * scene.scales.length
+            distances = [((other - corner) * inwards).sum(axis=1) for other in others]
+            supported = np.minimum(*distances) > -3e-11 * scene.scales.length
             pair = np.array([side, arc])
         else:
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -207,40 +207,40 @@ def _circle_track(
             supported &= sign * (m[:, 1] * axis[:, 0] - m[:, 0] * axis[:, 1]) <= 0
             pair = np.array([arc, first + count + edge])
         if link.radius == 0:
-            aside = 3e-8 * scene.scales.length
-            pairs = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
+            shift = 3e-8 * scene.scales.length
+            pairs = [close_fingers(scene, x + d, phi).contacts[:, finger] for d in (-shift, shift)]
             pair = np.sort(np.column_stack(pairs), axis=1)
-            about = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
-            supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
+            adjacent = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
+            supported = adjacent.all(axis=1) & (pair[:, 0] != pair[:, 1])
         return _label_pair(closed, vertex, finger, angle, pair, supported)
 
     return Track(pose, label, places)
 
 
-def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
-    """Wanted vertices with `vertex` on the palm and the centroid at x = 0, shape (m, n, 2) [m]."""
-    body = scene.polygon.vertices[vertex]
-    y = -(np.sin(phi) * body[0] + np.cos(phi) * body[1])
-    return np.stack(place_corners(scene, 0 * phi, y, phi, np.array(wanted)[:, None]), axis=-1)
+def _corners_at(scene: Scene, phi: Array, vertex: int, *vertices: int) -> Array:
+    """World vertices with `vertex` on the palm and the centroid at x = 0, shape (m, n, 2) [m]."""
+    corner = scene.polygon.vertices[vertex]
+    y = -(np.sin(phi) * corner[0] + np.cos(phi) * corner[1])
+    return np.stack(place_corners(scene, 0 * phi, y, phi, np.array(vertices)[:, None]), axis=-1)
 
 
 def _outward(scene: Scene, edge: int, phi: Array) -> Array:
     """Outward normal of an edge in the world, shape (n, 2)."""
     body = scene.polygon.vertices
-    run = body[(edge + 1) % len(body)] - body[edge]
-    heading = np.arctan2(-run[0], run[1]) + phi
+    direction = body[(edge + 1) % len(body)] - body[edge]
+    heading = np.arctan2(-direction[0], direction[1]) + phi
     return np.column_stack([np.cos(heading), np.sin(heading)])
 
 
 def _label_pair(
     closed: ClosedFinger, vertex: int, finger: int, angle: Array, pair: Numbers, possible: Flags
 ) -> Numbers:
-    """Labels where a closed finger is at `angle`, at which it touches a pair of contacts."""
+    """Labels of poses where a closed finger at `angle` touches a pair of contacts."""
     with np.errstate(invalid="ignore"):
-        off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
-        touches = (closed.touched[:, [finger]] == pair).any(axis=1)
-        # At the ends of a link angles lose digits.
-        possible = possible & ((off < 1e-11) | (touches & (off < 1e-7)))
+        deviation = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
+        touches = (closed.contacts[:, [finger]] == pair).any(axis=1)
+        # At the ends of a link angles are less accurate.
+        possible = possible & ((deviation < 1e-11) | (touches & (deviation < 1e-7)))
     labels = label_closed(closed, vertex)
     labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
     labels[~possible | (labels[:, 0] == NOWHERE)] = NOWHERE
@@ -268,11 +268,11 @@ def _label(
     closed = close_fingers(scene, x[inside], phi[inside])
     rows = np.cumsum(inside) - 1
     for group in groups:
-        (within,) = np.nonzero(inside[group])
-        if len(within):
-            at = group.start + within
-            part = ClosedFinger(*(values[rows[at]] for values in closed))
-            labels[at] = tracks[owners[group.start]].label(x[at], phi[at], part)
+        (columns,) = np.nonzero(inside[group])
+        if len(columns):
+            indices = group.start + columns
+            part = ClosedFinger(*(values[rows[indices]] for values in closed))
+            labels[indices] = tracks[owners[group.start]].label(x[indices], phi[indices], part)
     return labels
 
 
@@ -282,22 +282,22 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     owners = np.repeat(np.arange(len(tracks)), [len(track.places) for track in tracks])
     places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
     labels = label_places(owners, places)
-    leads, trails = np.diff(owners, prepend=-1) > 0, np.diff(owners, append=len(tracks)) > 0
-    # Where pieces begin and end: at the ends of tracks, and on both sides of changes of labels.
-    starts = [(owners[leads], places[leads], labels[leads])]
-    stops = [(owners[trails], places[trails])]
-    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & ~leads[1:])
+    firsts, lasts = np.diff(owners, prepend=-1) > 0, np.diff(owners, append=len(tracks)) > 0
+    # Pieces begin and end at the ends of tracks, and on both sides of changes of labels.
+    starts = [(owners[firsts], places[firsts], labels[firsts])]
+    stops = [(owners[lasts], places[lasts])]
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & ~firsts[1:])
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
-    # Eight changes between two neighbouring places at most.
+    # At most eight changes between two neighbouring places.
     for _ in range(8):
         if not len(low):
             break
         stop = high
         for _ in range(13):
             inner = low[:, None] + (high - low)[:, None] * np.arange(1, PARTS) / PARTS
-            seen = label_places(np.repeat(owner, PARTS - 1), inner.ravel())
-            same = (seen.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)
+            inner_labels = label_places(np.repeat(owner, PARTS - 1), inner.ravel())
+            same = (inner_labels.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)
             first = np.where(same.all(axis=1), PARTS - 1, same.argmin(axis=1))
             ends = np.column_stack([low, inner, high])
             rows = np.arange(len(ends))
@@ -306,26 +306,26 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
         starts.append((owner, high, new))
         stops.append((owner, low))
         # A second change may hide behind the first.
-        more = (new != last).any(axis=1) & (high < stop)
-        low, high, old, last = high[more], stop[more], new[more], last[more]
-        owner = owner[more]
-    begun, start, held = (np.concatenate(column) for column in zip(*starts, strict=True))
-    ended, stop = (np.concatenate(column) for column in zip(*stops, strict=True))
-    order, step = np.lexsort((start, begun)), LONGEST * scene.scales.length
-    ends = np.column_stack([start[order], stop[np.lexsort((stop, ended))]])
+        unfinished = (new != last).any(axis=1) & (high < stop)
+        low, high, old, last = high[unfinished], stop[unfinished], new[unfinished], last[unfinished]
+        owner = owner[unfinished]
+    indices, start, codes = (np.concatenate(column) for column in zip(*starts, strict=True))
+    stop_owners, stop = (np.concatenate(column) for column in zip(*stops, strict=True))
+    order, step = np.lexsort((start, indices)), LONGEST * scene.scales.length
+    ends = np.column_stack([start[order], stop[np.lexsort((stop, stop_owners))]])
     return [
         Piece(tracks[k], _fill(tracks[k], low, high, step), label)
-        for k, (low, high), label in zip(begun[order], ends.tolist(), held[order], strict=True)
+        for k, (low, high), label in zip(indices[order], ends.tolist(), codes[order], strict=True)
         if label[0] != NOWHERE and high > low
     ]
 
 
 def _fill(track: Track, low: float, high: float, step: float) -> Array:
-    """Places from `low` to `high`, with steps in x of `step` [m] at most, to draw the curve."""
+    """Places from `low` to `high` with steps in x of at most `step` [m], to draw the curve."""
     places = np.array([low, *track.places[(track.places > low) & (track.places < high)], high])
     for _ in range(8):
-        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > step)
-        if not len(wide):
+        long_steps = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > step)
+        if not len(long_steps):
             break
-        places = np.sort(np.append(places, (places[wide] + places[wide + 1]) / 2))
+        places = np.sort(np.append(places, (places[long_steps] + places[long_steps + 1]) / 2))
     return places

@@ -16,7 +16,7 @@ from ..common.arrays import Array, Flags, Numbers, interpolate
 from ..common.document import Drawn
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_alike
+from ..contacts.closing import close_fingers, contact_table, evaluate_each, find_reach, group_labels
 from ..contacts.elemental import Contact
 from ..contacts.formation import CurvePoint, Kinematics
 from ..geometry.curve import solve_tangent
@@ -32,26 +32,26 @@ from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, cut, label_inside, list_tracks, name_contacts
 from .formation_list import trace_problem
 
-WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # travel inside a cell: x, phi
-REGULAR = 1e-9  # least ratio of singular values of independent contacts; least determinant likewise
+DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # inside a cell: x, phi
+REGULAR = 1e-9  # least ratio of singular values, and least determinant, of independent contacts
 Flush = tuple[int | None, int]  # a finger (None for the palm) and an edge that lies flush on it
-CROSSED = -5  # cell of the places where the closed fingers would overlap
+CROSSED = -5  # cell of places at which the closed fingers overlap
 NODES = 24  # intervals of a border
 
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """A stretch of a cell border with one contact formation."""
+    """A part of a cell border with one contact formation."""
 
-    contacts: tuple[Contact, ...]  # the four that touch
-    # None where a contact passes from the side of a link to its tip or along the tip: there two
-    # names stand for one contact, which does not constrain the motion to the border
+    contacts: tuple[Contact, ...]  # four
+    # None if a contact passes from the side of a link to its tip or along the tip: two of the names
+    # are one contact, which does not constrain the motion to the border
     flush: Flush | None
     along: str  # {"x", "phi"}: the coordinate that increases along the border
     points: Array  # (n, 2) [m, rad]: x and phi
     z: Array  # (n, 5): configurations there
     forth: Flags  # (n,): whether a quasistatic motion with increasing coordinate is feasible
-    back: Flags  # (n,): with decreasing coordinate; both False where nothing is flush
+    back: Flags  # (n,): with decreasing coordinate; both False if nothing is flush
     ambiguous: Flags  # (n,): feasible in some direction, but contact forces are not unique
 
 
@@ -62,7 +62,7 @@ class Crossing:
     point: Array  # (2,) [m, rad]: x and phi
     z: Array  # (5,)
     contacts: tuple[Contact, ...]
-    # flush edges of the borders that meet; with one alone, a contact changes its name on a border
+    # flush edges of the borders that meet; if there is only one, a contact changes its name
     flush: tuple[Flush, ...]
 
 
@@ -70,19 +70,19 @@ class Crossing:
 class FormationMap(Drawn):
     """The cells, borders and crossings of a window of the (x, phi) plane."""
 
-    drawn_by = "map_figure", "draw_map"
+    drawing_function = "map_figure", "draw_map"
 
     problem: Problem
     x: Array  # x, phi (n_x,) and (n_phi,) [m] and [rad]: grid
     phi: Array
-    # (n_phi, n_x): index into `formations`; -1 and -2 where finger 1 and 2 is too short, -3 and -4
-    # where the joint of finger 1 and 2 is in the object, `CROSSED` where the fingers would overlap
+    # (n_phi, n_x): index into `formations`; -1 and -2 if finger 1 and 2 is too short, -3 and -4 if
+    # the joint of finger 1 and 2 is in the object, `CROSSED` if the fingers would overlap
     cell: Numbers
     formations: tuple[tuple[Contact, ...], ...]  # the three contacts of each cell
     borders: tuple[Border, ...]
     crossings: tuple[Crossing, ...]
-    places: Array  # (m, 2) [m, rad]: where directions inside cells were checked
-    possible: Flags  # (m, 4): whether quasistatic motions in the directions `WAYS` are feasible
+    places: Array  # (m, 2) [m, rad]: at which directions inside cells were checked
+    possible: Flags  # (m, 4): whether quasistatic motions in the `DIRECTIONS` are feasible
     ambiguous: Flags  # (m,): one more would be, but contact forces are not unique
 
     @property
@@ -133,10 +133,10 @@ def build_map(
     tracks = list(list_tracks(scene, window, samples))
     borders = _build_borders(problem, cut(scene, tracks, window), limit)
     report("map: crossings and directions")
-    # At a lattice of places inside cells.
+    # Directions are checked at a lattice of places inside cells.
     ends = np.linspace(*window.x, 25), np.linspace(*window.phi, 25)
-    middles = np.meshgrid(*((values[1:] + values[:-1]) / 2 for values in ends))
-    places = np.column_stack([part.ravel() for part in middles])
+    centres = np.meshgrid(*((values[1:] + values[:-1]) / 2 for values in ends))
+    places = np.column_stack([part.ravel() for part in centres])
     closed = close_fingers(scene, *places.T)
     inside = label_inside(scene, closed)
     free = inside[:, 0] != NOWHERE
@@ -145,8 +145,8 @@ def build_map(
     kinematics = evaluate_each(scene, labels, z)
     matrix = np.concatenate([kinematics.A, pose], axis=1)
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
-    tangents = np.zeros((len(z), len(WAYS), 5))
-    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ WAYS.T).swapaxes(1, 2)
+    tangents = np.zeros((len(z), len(DIRECTIONS), 5))
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ DIRECTIONS.T).swapaxes(1, 2)
     directions = _check_motions(problem, labels, z, kinematics, tangents, limit)
     formations = tuple(name_contacts(contact_table(scene), row) for row in rows)
     parts = cells, formations, tuple(borders), _find_crossings(scene, borders)
@@ -171,22 +171,23 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     flags = np.zeros((3, len(z)), dtype=bool)
     if flush.any():
         rows = np.array([ROWS[name] for name in along])[owner[flush]]
-        chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
-        kinematics = evaluate_each(scene, chosen, z[flush])
+        four_labels = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
+        kinematics = evaluate_each(scene, four_labels, z[flush])
         weights = np.sqrt(metric_weights(scene))
-        _, sizes, right = np.linalg.svd(kinematics.A / weights)
-        z_s = right[:, -1] / weights
+        _, sizes, right_vectors = np.linalg.svd(kinematics.A / weights)
+        z_s = right_vectors[:, -1] / weights
         z_s *= np.where(z_s[np.arange(len(rows)), rows] < 0, -1.0, 1.0)[:, None]
         z_s[~(sizes[:, -1] > REGULAR * sizes[:, 0])] = 0.0
-        motions = problem, chosen, z[flush], kinematics, np.stack([z_s, -z_s], axis=1), limit
-        possible, flags[2, flush] = _check_motions(*motions)
+        tangents = np.stack([z_s, -z_s], axis=1)
+        checked = _check_motions(problem, four_labels, z[flush], kinematics, tangents, limit)
+        possible, flags[2, flush] = checked
         flags[:2, flush] = possible.T
     table, borders = contact_table(scene), []
     for index, piece in enumerate(pieces):
-        mine = owner == index
+        selected = owner == index
         contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
-        curve = along[index], points[mine], z[mine]
-        borders.append(Border(contacts, piece.track.flush, *curve, *flags[:, mine]))
+        curve = along[index], points[selected], z[selected]
+        borders.append(Border(contacts, piece.track.flush, *curve, *flags[:, selected]))
     return borders
 
 
@@ -196,61 +197,61 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
     size = 3e-5 * np.array([scene.scales.length, 1.0])
     table = contact_table(scene)
-    crossings, free = [], np.ones(len(points), dtype=bool)
+    crossings, unassigned = [], np.ones(len(points), dtype=bool)
     for k in range(len(points)):
-        if not free[k]:
+        if not unassigned[k]:
             continue
-        same = free & (np.abs(points - points[k]) < size).all(axis=1)
-        free &= ~same
-        meeting = [ends[i][0] for i in np.flatnonzero(same)]
-        met = {contact for border in meeting for contact in border.contacts}
-        if len(met) < 5:
+        same = unassigned & (np.abs(points - points[k]) < size).all(axis=1)
+        unassigned &= ~same
+        meeting_borders = [ends[i][0] for i in np.flatnonzero(same)]
+        all_contacts = {contact for border in meeting_borders for contact in border.contacts}
+        if len(all_contacts) < 5:
             continue
         border, end = ends[k]
         z = border.z[end]
-        # Where a finger's first touch jumps across its joint, not all contacts touch at once.
-        label = sorted(table.index(contact) for contact in met)
+        # If the first contact of a finger jumps across its joint, not all contacts touch at once.
+        label = sorted(table.index(contact) for contact in all_contacts)
         gaps = np.abs(evaluate_each(scene, np.array([label]), z[None]).C[0])
         contacts = tuple(table[k] for k in np.array(label)[gaps < scene.touching])
         if len(contacts) >= 5:
-            edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))
+            edges = tuple(dict.fromkeys(b.flush for b in meeting_borders if b.flush is not None))
             crossings.append(Crossing(points[k], z, contacts, edges))
     return tuple(crossings)
 
 
 def _check_motions(
-    problem: Problem, labels: Numbers, z: Array, kinematics: Kinematics, ways: Array, limit: float
+    problem: Problem, labels: Numbers, z: Array, kinematics: Kinematics, paths: Array, limit: float
 ) -> tuple[Flags, Flags]:
-    """Whether quasistatic motions along tangents `ways`, (n, k, 5), are feasible, (n, k).
+    """Whether quasistatic motions on `paths`, tangents (n, k, 5), are feasible, (n, k).
 
-    And whether one more would be, but contact forces are not unique, (n,): their uniqueness margin
-    is below the `limit`. Tangents that are zero are left out.
+    And whether another one would be, (n,), if its contact forces were unique: their uniqueness
+    margin is below the `limit`. Zero tangents are skipped.
     """
-    scene, regular = problem.scene, ways.any(axis=(1, 2))
-    held, unique = np.zeros((2, *ways.shape[:2]), dtype=bool)
-    for k, z_s in enumerate(ways.swapaxes(0, 1)):
-        every, of_all = CurvePoint(z, z_s, 0 * z, kinematics), Directions.of(kinematics, z_s)
-        for formation, mine in group_alike(scene, labels):
-            rows = np.flatnonzero(mine & regular)
+    scene, regular = problem.scene, paths.any(axis=(1, 2))
+    balanced, unique = np.zeros((2, *paths.shape[:2]), dtype=bool)
+    for k, z_s in enumerate(paths.swapaxes(0, 1)):
+        points, signs_all = CurvePoint(z, z_s, 0 * z, kinematics), Directions.of(kinematics, z_s)
+        for formation, selected in group_labels(scene, labels):
+            rows = np.flatnonzero(selected & regular)
             if formation.n_constraints == 3:
-                wrench = force_rows(formation, kinematics, of_all)[rows, :, :3]
+                wrench = force_rows(formation, kinematics, signs_all)[rows, :, :3]
                 rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
-            point, directions = every.pick(rows), Directions(*(signs[rows] for signs in of_all))
+            point, directions = points.pick(rows), Directions(*(signs[rows] for signs in signs_all))
             forces = inverse(formation, point, directions)
             limits = InternalForceLimits.of(formation, forces, point.z_s[:, 3:])
-            still = np.zeros(len(rows))
-            low, high = limits.find_span(still, still, problem.epsilon)
-            held[rows, k] = low <= high
+            zeros = np.zeros(len(rows))
+            low, high = limits.find_span(zeros, zeros, problem.epsilon)
+            balanced[rows, k] = low <= high
             minors = find_minors(formation, point.kinematics, directions.Xi)
             unique[rows, k] = minors.ratios >= limit
-    return held & unique, np.any(held & ~unique, axis=1)
+    return balanced & unique, np.any(balanced & ~unique, axis=1)
 
 
 @exclusive
 def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
-    """Window of all x that both fingers reach, and of phi up to the flush angles around the phases.
+    """Window of all x within reach, and of phi up to the flush angles around the phases.
 
-    Or of phi in a range [deg]. InputError if both fingers reach the object nowhere.
+    With `phi_deg`, phi is in this range [deg]. InputError if both fingers reach the object nowhere.
     """
     scene = problem.scene
     if phi_deg is not None:
@@ -261,21 +262,21 @@ def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) 
         angles += [v for p in problem.phases for row, v in p.until.poses if row == ROWS["phi"]]
         angles += [goal.find_angle(scene, angles[-1]) for goal in problem.goals]
         low, high = min(angles), max(angles)
-        around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(scene)
-        flush = np.array([angle for angle, _ in around])
+        flush_angles = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(scene)
+        flush = np.array([angle for angle, _ in flush_angles])
         # An edge that is flush at an end of the plan does not count.
         before, after = flush[flush < low - 1e-6].max(), flush[flush > high + 1e-6].min()
-        # The next edge but one stays outside.
-        beyond = min(math.radians(6.0), float(after - before) / 8)
-        low, high = float(before) - beyond, float(after) + beyond
+        # The margin excludes further flush angles.
+        margin = min(math.radians(6.0), float(after - before) / 8)
+        low, high = float(before) - margin, float(after) + margin
     left, right = find_reach(scene)
     grid = np.linspace(left, max(left, right), 60)
     _, obstacle = label_grid(scene, grid, np.linspace(low, high, 60))
-    reached = grid[(obstacle == 0).any(axis=0)]
-    if not len(reached):
+    feasible = grid[(obstacle == 0).any(axis=0)]
+    if not len(feasible):
         raise InputError(problem.source, "fingers", "nowhere do both reach the object")
     step = grid[1] - grid[0]
-    return Window((float(reached[0] - step), float(reached[-1] + step)), (low, high))
+    return Window((float(feasible[0] - step), float(feasible[-1] + step)), (low, high))
 
 
 def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
@@ -288,46 +289,46 @@ def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
-    """Estimated least times along n borders with something flush, end to end, (n, 2) [s].
+    """Estimated least times along n borders with a flush edge, end to end, (n, 2) [s].
 
-    With the coordinate along which points are ordered increasing, and decreasing; infinite where no
-    motion keeps the limits, friction jams or contact forces are not unique. Limits are kept at one
-    place of each interval, with any internal force.
+    In both directions: with the coordinate `along` increasing, and decreasing. Infinite if no
+    motion keeps the limits, friction jams or contact forces are not unique. Limits are enforced at
+    one place of each interval, with any internal force.
     """
     if not borders:
         return np.zeros((0, 2))
     scene, weights = problem.scene, metric_weights(problem.scene)
-    (steps, places, part), table = make_cosine_grid(NODES), contact_table(scene)
-    every = []
-    for points in (each for border in borders for each in (border.z, border.z[::-1])):
+    (steps, places, fractions), table = make_cosine_grid(NODES), contact_table(scene)
+    samples = []
+    for points in (path for border in borders for path in (border.z, border.z[::-1])):
         chords = np.diff(points, axis=0)
         arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
         s = places * arcs[-1]
         z = interpolate(s, arcs, points)
-        every.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
-    z, chord, length = (np.concatenate(column) for column in zip(*every, strict=True))
+        samples.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
+    z, chord, length = (np.concatenate(column) for column in zip(*samples, strict=True))
     indices = [[table.index(contact) for contact in border.contacts] for border in borders]
     labels = np.repeat(np.array(indices), 2 * NODES, axis=0)
-    # One Newton step: between points of the map the contacts do not quite close.
+    # One Newton step closes the contacts of interpolated configurations.
     at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
-    run = chord / np.sqrt(chord**2 @ weights)[:, None]
-    at = evaluate_each(scene, labels, z, run)
-    z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
-    # With the share of length as path parameter.
-    whole, durations = CurvePoint(z, length * z_s, length**2 * z_ss, at), np.empty(2 * len(borders))
-    for formation, mine in group_alike(scene, labels):
-        point = whole.pick(mine)
+    tangent = chord / np.sqrt(chord**2 @ weights)[:, None]
+    at = evaluate_each(scene, labels, z, tangent)
+    z_s, z_ss = solve_tangent(at.P, at.P_dot_v, tangent, weights)
+    # The path parameter is s over the length.
+    curve, durations = CurvePoint(z, length * z_s, length**2 * z_ss, at), np.empty(2 * len(borders))
+    for formation, selected in group_labels(scene, labels):
+        point = curve.pick(selected)
         directions = Directions.of(point.kinematics, point.z_s)
         forces = inverse(formation, point, directions)
         limits = make_limits(formation, problem.epsilon)
         rows, cap = PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
         inertia = reduced_inertia(formation, point.kinematics, directions)
         ratios = find_minors(formation, point.kinematics, directions.Xi).ratios
-        # No motion passes where b <= 0.
-        closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-        rows[closed], cap[closed] = 0.0, 0.0
-        on_paths = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
-        motion = speed_sweep(on_paths, steps, part, sweeps=2)
-        durations[mine[::NODES]] = motion.find_durations(steps)
+        # b <= 0: no motion.
+        infeasible = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
+        rows[infeasible], cap[infeasible] = 0.0, 0.0
+        path_limits = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
+        motion = speed_sweep(path_limits, steps, fractions, sweeps=2)
+        durations[selected[::NODES]] = motion.find_durations(steps)
     return durations.reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Equations of motion, limits, impacts; the least uniqueness margin that can be asked for."""
+"""Equations of motion, limits, impacts, statics; the option of the least uniqueness margin."""
 
 from __future__ import annotations
 

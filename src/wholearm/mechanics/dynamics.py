@@ -4,8 +4,8 @@ Eqs. (1)-(4) are together (notation: `README.md`), with b = B z' + D sigma of th
 
     M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0.
 
-A sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free, in c. Three routes
-through the equations:
+A sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free, in c. The equations are
+solved in three ways:
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
@@ -30,18 +30,18 @@ from ..contacts.formation import CurvePoint, Formation, Kinematics
 from ..scene.model import Scene
 
 Fixed = tuple[tuple[int, float | Array], ...]
-"""Rows of z, and values that they have to take, one or (n,)."""
+"""Rows of z and their prescribed values, one or (n,)."""
 
 
 class Directions(NamedTuple):
-    """Signs that friction depends on."""
+    """Signs of the velocities that friction opposes."""
 
-    Xi: Array  # (n_c,): sliding directions of the contacts; those of rolling ones do not count
+    Xi: Array  # (n_c,): sliding directions of the contacts; ignored for rolling ones
     sigma: Array  # (2,): directions of the joints
 
     @staticmethod
     def of(kinematics: Kinematics, v: Array) -> Directions:
-        """Those of contacts that slide and joints that turn with velocities, shape (n, 5)."""
+        """Signs of the sliding and joint velocities at velocities v, shape (n, 5)."""
         slip = np.einsum("nij,nj->ni", kinematics.A_t, v)
         return Directions(np.sign(slip), np.sign(v[:, 3:]))
 
@@ -69,7 +69,7 @@ class PathForces(NamedTuple):
 
 
 def stack_motion(a: Array, b: Array, internal: Array) -> Array:
-    """What coefficients multiply: (1, a, b, s', lambda), shape (n, 5)."""
+    """Factors of the coefficients: (1, a, b, s', lambda), shape (n, 5)."""
     return np.stack([np.ones_like(b), a, b, np.sqrt(np.maximum(b, 0.0)), internal], axis=-1)
 
 
@@ -84,10 +84,10 @@ def forward(
 ) -> tuple[Array, Array]:
     """Accelerations (n, 5) and contact forces (n, n_c + R) at velocities v under torques tau."""
     scene, G = formation.scene, force_rows(formation, kinematics, directions)
-    over, applied = kinematics.P / scene.mass_diagonal, scene.applied_force - scene.viscous * v
+    P_M, applied = kinematics.P / scene.mass_diagonal, scene.applied_force - scene.viscous * v
     applied[:, 3:] += tau - scene.dry[3:] * directions.sigma
-    right = -kinematics.P_dot_v - np.einsum("nij,nj->ni", over, applied)
-    c = np.linalg.solve(over @ G.transpose(0, 2, 1), right[..., None])[..., 0]
+    rhs = -kinematics.P_dot_v - np.einsum("nij,nj->ni", P_M, applied)
+    c = np.linalg.solve(P_M @ G.transpose(0, 2, 1), rhs[..., None])[..., 0]
     return (applied + np.einsum("nij,ni->nj", G, c)) / scene.mass_diagonal, c
 
 
@@ -110,7 +110,7 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
 
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
-    """Reduced inertia over the frictionless, (n,): jamming at zero and below, or not finite."""
+    """Reduced inertia over that without friction, (n,): jamming if not positive or not finite."""
     inverse_mass = 1 / formation.scene.mass_diagonal
     P = kinematics.P
     G = force_rows(formation, kinematics, directions)
@@ -122,7 +122,7 @@ def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Di
 
 
 def inverse(formation: Formation, point: CurvePoint, directions: Directions) -> PathForces:
-    """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
+    """Inverse dynamics along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
     number: the internal force lambda along a unit null vector; three leave none. `directions` are
@@ -132,16 +132,16 @@ def inverse(formation: Formation, point: CurvePoint, directions: Directions) -> 
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     mass, count = scene.mass_diagonal, wrench.shape[2]
-    # Of rank two, as where a tip is on a flush edge's vertex, it has no single null vector.
+    # At rank two, as for a tip on a vertex of a flush edge, the null vector is not unique.
     null = np.zeros((len(z), count)) if count == 3 else null_vector(wrench)
-    right = np.zeros((len(z), count, 3))
-    right[:, :3, ONE] = -scene.applied_force[:3]
-    right[:, :3, A] = mass[:3] * z_s[:, :3]
-    right[:, :3, B] = mass[:3] * z_ss[:, :3]
-    # Bordering by the null vector makes each solution the shortest one.
+    rhs = np.zeros((len(z), count, 3))
+    rhs[:, :3, ONE] = -scene.applied_force[:3]
+    rhs[:, :3, A] = mass[:3] * z_s[:, :3]
+    rhs[:, :3, B] = mass[:3] * z_ss[:, :3]
+    # With the null vector as last row each solution has the least norm.
     matrix = wrench if count == 3 else np.concatenate([wrench, null[:, None, :]], axis=1)
     C = np.zeros((len(z), count, 5))
-    C[..., :3], C[..., LAMBDA] = np.linalg.solve(matrix, right), null
+    C[..., :3], C[..., LAMBDA] = np.linalg.solve(matrix, rhs), null
     T = -np.einsum("nij,niq->njq", G[:, :, 3:], C)
     T[..., ONE] += scene.dry[3:] * directions.sigma
     T[..., A] += mass[3:] * z_s[:, 3:]
@@ -150,16 +150,16 @@ def inverse(formation: Formation, point: CurvePoint, directions: Directions) -> 
     return PathForces(C, T)
 
 
-def null_vector(matrix: Array, least: float = 0.0) -> Array:
+def null_vector(matrix: Array, min_size: float = 0.0) -> Array:
     """Unit null vector of each (k, k + 1) matrix, by its minors (continuous), shape (n, k + 1).
 
-    NaN where the minors have at most the size `least`: it is not unique.
+    NaN if the norm of the minors is at most `min_size`: it is not unique.
     """
     count = matrix.shape[2]
     minors = [np.linalg.det(np.delete(matrix, k, axis=2)) for k in range(count)]
     null = np.stack(minors, axis=1) * (-1.0) ** np.arange(count)
     size = np.linalg.norm(null, axis=1)[:, None]
-    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > least))
+    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > min_size))
 
 
 def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
@@ -177,25 +177,25 @@ def metric_weights(scene: Scene) -> Array:
     return np.array([1.0, 1.0, rho**2, rho**2, rho**2])
 
 
-def move_least(P: Array, right: Array, metric: Array) -> Array:
-    """The least displacements with P dz = right, (n, n_p), in a diagonal metric, shape (n, 5)."""
-    over = P / metric
-    amounts = np.linalg.solve(over @ P.transpose(0, 2, 1), right[..., None])[..., 0]
-    return np.asarray(np.einsum("nij,ni->nj", over, amounts))
+def solve_min_norm(P: Array, rhs: Array, metric: Array) -> Array:
+    """Displacements of least norm with P dz = rhs, (n, n_p), in a diagonal metric, shape (n, 5)."""
+    P_M = P / metric
+    multipliers = np.linalg.solve(P_M @ P.transpose(0, 2, 1), rhs[..., None])[..., 0]
+    return np.asarray(np.einsum("nij,ni->nj", P_M, multipliers))
 
 
-def find_freedoms(P: Array, metric: Array, least: float) -> Array:
+def find_freedoms(P: Array, metric: Array, tolerance: float) -> Array:
     """Directions with P dz = 0 for P (n_p, 5), orthonormal in a diagonal metric, shape (5, f).
 
-    Singular values up to `least` times the largest one count as zero.
+    Singular values up to `tolerance` times the largest one count as zero.
     """
     root = np.sqrt(metric)
-    _, values, right = np.linalg.svd(P / root)
-    return np.asarray(right[int((values > least * values[0]).sum()) :].T / root[:, None])
+    _, values, vectors = np.linalg.svd(P / root)
+    return np.asarray(vectors[int((values > tolerance * values[0]).sum()) :].T / root[:, None])
 
 
 def measure_speed(scene: Scene, v: Array) -> float:
-    """Size of a velocity [m/s] or displacement [m], shape (5,), in the metric of curves."""
+    """Norm of a velocity [m/s] or displacement [m], shape (5,), in the metric of arc length."""
     return float(np.sqrt(metric_weights(scene) @ v**2))
 
 
@@ -223,38 +223,38 @@ def close_all(
     slip : (R,) [m]  slip coordinates of rolling contacts
     fixed            rows of z and their values
     active           limits of the formation that are zero
-    metric : (5,)    diagonal of what "nearest" is measured in, by default that of curves
+    metric : (5,)    diagonal of the metric, by default that of arc length
     """
     metric = metric_weights(formation.scene) if metric is None else metric
     rho = formation.scene.scales.length
     steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
     units = [rho if row < 2 else 1.0 for row, _ in fixed]
     sizes = np.array([rho] * formation.n_constraints + units + [rho] * len(active))
-    solutions, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
+    solutions, z, remaining = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
     for _ in range(50):
         kinematics = formation.evaluate(z, np.zeros(z.shape))
         residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
         rows = kinematics.P
         for row, value in fixed:
-            values = np.broadcast_to(value, len(solutions))[left]
+            values = np.broadcast_to(value, len(solutions))[remaining]
             residual = np.column_stack([residual, z[:, row] - values])
-            one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
-            rows = np.concatenate([rows, one], axis=1)
+            unit = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
+            rows = np.concatenate([rows, unit], axis=1)
         if active:
             residual = np.hstack([residual, formation.evaluate_limits(z)[:, active]])
-            near = (z[:, None] + np.vstack([steps, -steps])).reshape(-1, 5)
-            around = formation.evaluate_limits(near)[:, active].reshape(len(z), 2, 5, -1)
-            slopes = (around[:, 0] - around[:, 1]) / (2 * steps.diagonal()[:, None])
+            neighbours = (z[:, None] + np.vstack([steps, -steps])).reshape(-1, 5)
+            differences = formation.evaluate_limits(neighbours)[:, active].reshape(len(z), 2, 5, -1)
+            slopes = (differences[:, 0] - differences[:, 1]) / (2 * steps.diagonal()[:, None])
             rows = np.concatenate([rows, slopes.swapaxes(1, 2)], axis=1)
         rows, residual = rows / sizes[:, None], residual / sizes
         lift = (rows / metric).swapaxes(1, 2)
         change = (lift @ np.linalg.pinv(rows @ lift, rcond=1e-12) @ residual[..., None])[..., 0]
-        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
-        turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
-        z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
+        # Long steps of the angles could lead to another solution: at most a tenth of a radian.
+        rotation = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
+        z = z - change * np.minimum(1.0, 0.1 / np.maximum(rotation, 1e-12))
         closed = np.abs(residual).max(axis=1) < 3e-11
-        solutions[left[closed]] = z[closed]
-        z, left = z[~closed], left[~closed]
-        if not len(left):
+        solutions[remaining[closed]] = z[closed]
+        z, remaining = z[~closed], remaining[~closed]
+        if not len(remaining):
             break
     return solutions

@@ -1,7 +1,7 @@
 """Plastic impacts: projection of the velocity onto the next formation, by impulses with friction.
 
-Equations: `README.md`, with P of rolling contacts in place of A; their impulses stay in the cones.
-The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction.
+Equations: `README.md`, with P in place of A if contacts roll; their impulses stay in the cones. The
+energy loss is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, measure_speed, metric_weights, reduced_inertia
 from .limits import force_limit_rows
 
-ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
+ROUNDING = 1e-6  # relative momentum or speed below which violations count as rounding errors
 
 
 class ViolationKind(Enum):
-    """What keeps an impact from throwing the velocity onto a formation."""
+    """Reasons why an impact onto a formation is not possible."""
 
-    JAM = "jam"  # friction makes the reduced inertia vanish or turn negative
-    HELD = "held"  # no sliding directions are those of the velocity that they give
-    PULL = "pull"  # a contact would have to pull
-    SLIP = "slip"  # a rolling contact would leave its friction cone
-    CLOSING = "closing"  # something that touches, but is not in the formation, would be driven into
+    JAM = "jam"  # jamming: the reduced inertia with friction is not positive
+    HELD = "held"  # no sliding directions agree with the velocity after the impact
+    PULL = "pull"  # the normal impulse of a contact is negative
+    SLIP = "slip"  # the impulse of a rolling contact is outside its friction cone
+    CLOSING = "closing"  # a touching contact outside of the formation has a closing velocity
 
 
 class ImpactViolation(NamedTuple):
-    """One reason why an impact is not possible."""
+    """A violated condition of an impact."""
 
     kind: ViolationKind
-    name: str  # the contact, or what would happen
-    # its impulse or margin to slipping [N s], or rate [m/s]; the reduced inertia over that without
+    name: str  # the contact, or the event in words
+    # impulse or margin to slipping [N s], rate [m/s], or the reduced inertia over that without
     # friction
     value: float
 
-    def describe(self, per: str = "") -> str:
-        """Say it in words; `per` is what the numbers are for, if not for the velocity itself."""
+    def describe(self, suffix: str = "") -> str:
+        """The violation in words; `suffix` follows the units, such as " per m/s"."""
         if self.kind is ViolationKind.PULL:
-            return f"impulse on {self.name} would be {self.value:.3g} N s{per}"
+            return f"impulse on {self.name} would be {self.value:.3g} N s{suffix}"
         if self.kind is ViolationKind.SLIP:
-            return f"{self.name} would slip, {-self.value:.3g} N s{per} beyond its friction cone"
+            return f"{self.name} would slip, {-self.value:.3g} N s{suffix} beyond its friction cone"
         if self.kind is ViolationKind.CLOSING:
-            return f"{self.name}, at {-self.value:.3g} m/s{per}"
+            return f"{self.name}, at {-self.value:.3g} m/s{suffix}"
         if self.kind is ViolationKind.HELD:
             return f"friction would hold {self.name}"
         return f"{self.name} would jam, with {self.value:.3g} of the reduced inertia"
@@ -55,24 +55,24 @@ class ImpactViolation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Impact:
-    """What an impact does to a velocity."""
+    """Velocity and impulses after a plastic impact."""
 
-    formation: Formation  # the new one
+    formation: Formation  # after the impact
     v: Array  # (5,): v+, in m/s and rad/s; NaN if the formation jams
-    # (n_c + R,) [N s]: impulses of the contacts: normal, then tangential of rolling ones. NaN
-    # likewise.
+    # (n_c + R,) [N s]: impulses of the contacts: normal, then tangential of rolling ones; NaN if
+    # the formation jams
     p: Array
-    Xi: Array  # (n_c,): sliding directions that friction assumes, zero for rolling contacts
-    # why it is not possible, the worst first; empty if it is
+    Xi: Array  # (n_c,): assumed sliding directions, zero for rolling contacts
+    # by kind, the largest first; empty if the impact is possible
     violations: tuple[ImpactViolation, ...]
 
     @property
     def possible(self) -> bool:
-        """Whether the motion goes on in the new formation."""
+        """Whether the motion continues in the formation."""
         return not self.violations
 
     @property
-    def least(self) -> tuple[str, float]:
+    def least_impulse(self) -> tuple[str, float]:
         """The contact with the least normal impulse, and that impulse [N s]."""
         k = int(self.p[: self.formation.n_contacts].argmin())
         return self.formation.names[k], float(self.p[k])
@@ -82,15 +82,15 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
     """Plastic impact of a velocity `v` at `z`, (5,) each, between closed formations."""
     kinematics, mass = after.evaluate(z[None], v[None]), after.scene.mass_diagonal
     P, A_t = kinematics.P[0], kinematics.A_t[0]
-    slides = np.ones(after.n_contacts)
-    slides[list(after.rolling_rows)] = 0.0
-    rolls = [after.names[row] for row in after.rolling_rows]
+    sliding = np.ones(after.n_contacts)
+    sliding[list(after.rolling_rows)] = 0.0
+    rolling_names = [after.names[row] for row in after.rolling_rows]
 
     def find_sliding(velocity: Array) -> tuple[float, ...]:
-        return tuple(slides * np.where(A_t @ velocity < 0, -1.0, 1.0))
+        return tuple(sliding * np.where(A_t @ velocity < 0, -1.0, 1.0))
 
     def strike(Xi: Array) -> Impact:
-        """The impact with given sliding directions."""
+        """The impact for assumed sliding directions."""
         directions = Directions(Xi, np.ones(2))
         ratio = float(reduced_inertia(after, kinematics, directions)[0])
         if not ratio > 0:
@@ -103,7 +103,7 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
         values = (
             (ViolationKind.HELD, speed, after.names, Xi * (A_t @ v_after)),
             (ViolationKind.PULL, momentum, after.names, normal),
-            (ViolationKind.SLIP, momentum, [*rolls, *rolls], cones),
+            (ViolationKind.SLIP, momentum, [*rolling_names, *rolling_names], cones),
             (ViolationKind.CLOSING, speed, *_rates(before, after, z, v_after)),
         )
         violations = [
@@ -114,18 +114,18 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
         ]
         return Impact(after, v_after, p, Xi, tuple(violations))
 
-    # Try the sliding of the frictionless impact, then that of each answer; rarely any other.
-    likely = find_sliding(solve_impulses(mass, P, P, v)[0])
-    others = product(*((1.0, -1.0) if one else (0.0,) for one in slides))
-    tried: dict[tuple[float, ...], Impact] = {}
-    for choice in (likely, *others):
+    # Fixed-point iterations of the sliding directions, first from those without friction.
+    guess = find_sliding(solve_impulses(mass, P, P, v)[0])
+    others = product(*((1.0, -1.0) if slides else (0.0,) for slides in sliding))
+    impacts: dict[tuple[float, ...], Impact] = {}
+    for choice in (guess, *others):
         Xi = choice
-        while Xi not in tried:
-            tried[Xi] = impact = strike(np.array(Xi))
+        while Xi not in impacts:
+            impacts[Xi] = impact = strike(np.array(Xi))
             if not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}:
                 return impact
             Xi = find_sliding(impact.v)
-    return tried[likely]
+    return impacts[guess]
 
 
 def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
@@ -141,7 +141,7 @@ def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tup
 def _rates(
     before: Formation, after: Formation, z: Array, v: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names and opening rates [m/s] of what touches but is not in the new formation."""
+    """Texts and opening rates [m/s] of touching contacts that are not in the new formation."""
     released = {k: c for k, c in enumerate(before.contacts) if c not in after.contacts}
     texts = [f"{contact.name} would not part" for contact in released.values()]
     rates = list((before.evaluate(z[None], v[None]).A[0] @ v)[list(released)])
@@ -154,7 +154,7 @@ def _rates(
     if others:
         scene = after.scene
         h = 1e-5 * scene.scales.length / max(measure_speed(scene, v), np.finfo(float).tiny)
-        ahead, behind = after.evaluate_limits(np.array([z + h * v, z - h * v]))[:, others]
-        rates += list((ahead - behind) / (2 * h))
+        later, earlier = after.evaluate_limits(np.array([z + h * v, z - h * v]))[:, others]
+        rates += list((later - earlier) / (2 * h))
         texts += [after.limits[k].text for k in others]
     return tuple(texts), np.array(rates)

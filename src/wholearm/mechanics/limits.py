@@ -1,7 +1,7 @@
 """Motion limits, low <= rows (c, tau, theta') <= high: contact forces, torques and joint speeds.
 
-`README.md` lists them. Another limit takes another maker in `MAKERS`: planners, checks between
-nodes, tightening and advice go through a `LimitSet`.
+`README.md` lists them. A further limit is one function in `MAKERS`: planners, checks between
+nodes, tightening and advice use a `LimitSet`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ EPSILON = "epsilon"  # key of the least normal force
 class MotionLimit:
     """One limit, low <= rows y <= high, with y = (c, tau, theta')."""
 
-    kind: str  # what finds it in a `LimitSet`
-    part: str  # the contact or finger that it is about
+    kind: str  # key for selection from a `LimitSet`
+    part: str  # the contact or finger
     text: str  # the limit in words, with its value
     unit: str  # of its rows
     rows: Array  # (r, n_c + R + 4)
-    low: Array  # low, high (r,): infinite where there is none
+    low: Array  # low, high (r,): bounds, infinite if there is none
     high: Array
     scale: float  # unit of shortfalls
-    parameter: Parameter  # the single number whose change relaxes it
-    weight: Array  # (r,): by how much its bounds give way per unit of that
+    parameter: Parameter  # the number whose change relaxes the limit
+    weight: Array  # (r,): relaxation of the bounds per unit of the parameter
 
 
 @dataclass(frozen=True, eq=False)
 class LimitSet:
-    """Limits with their rows one below the other, which are found by kind and never by position."""
+    """Limits with stacked rows, selected by kind."""
 
     limits: tuple[MotionLimit, ...]
 
@@ -60,7 +60,7 @@ class LimitSet:
 
     @cached_property
     def owners(self) -> Numbers:
-        """Which limit each row belongs to, shape (m,)."""
+        """Index of the limit of each row, shape (m,)."""
         return np.repeat(np.arange(len(self.limits)), [len(limit.low) for limit in self.limits])
 
     @cached_property
@@ -94,21 +94,21 @@ class LimitSet:
         return LimitSet(tuple(limit for limit in self.limits if limit.kind not in kinds))
 
     def split(self, last: int) -> tuple[LimitSet, LimitSet]:
-        """The limits that depend on more than the `last` columns, and the others.
+        """The limits that depend on columns before the `last` ones, and the others.
 
-        The last two are the speeds of the joints; torques are before them.
+        The last two columns are joint speeds, the two before them torques.
         """
-        more = [limit for limit in self.limits if limit.rows[:, :-last].any()]
-        others = [limit for limit in self.limits if limit not in more]
-        return LimitSet(tuple(more)), LimitSet(tuple(others))
+        dependent = [limit for limit in self.limits if limit.rows[:, :-last].any()]
+        others = [limit for limit in self.limits if limit not in dependent]
+        return LimitSet(tuple(dependent)), LimitSet(tuple(others))
 
     def weigh(self, key: str) -> Array:
-        """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
+        """Relaxation of the bounds of each row per unit of a parameter, shape (m,)."""
         weights = [(limit.parameter.key == key) * limit.weight for limit in self.limits]
         return np.concatenate(weights)
 
     def find_slack(self, values: Array) -> Array:
-        """How far one-sided limits are from being missed, shape (..., n), from rows y, (..., m)."""
+        """Slack of one-sided limits, shape (..., n), from rows y, (..., m)."""
         rows, signs, bounds = self.sides
         return np.asarray(signs * (values[..., rows] - bounds))
 
@@ -119,25 +119,25 @@ class LimitSet:
         slack[..., 0] -= signs * bounds
         return np.asarray(slack)
 
-    def fold(self, of_sides: Array) -> Array:
-        """The larger value of the sides of each row, shape (..., m), from (..., n)."""
-        folded = np.full((*of_sides.shape[:-1], len(self.low)), -np.inf)
+    def fold(self, values: Array) -> Array:
+        """Largest value of the one or two sides of each row, shape (..., m), from (..., n)."""
+        largest = np.full((*values.shape[:-1], len(self.low)), -np.inf)
         for k, row in enumerate(self.sides[0]):
-            folded[..., row] = np.maximum(folded[..., row], of_sides[..., k])
-        return folded
+            largest[..., row] = np.maximum(largest[..., row], values[..., k])
+        return largest
 
-    def list_misses(self, values: Array, least: float) -> Iterator[tuple[MotionLimit, float, int]]:
-        """Limits that rows y, (n, m), miss by `least` of their scale: how much, and where."""
+    def list_violated(self, values: Array, tol: float) -> Iterator[tuple[MotionLimit, float, int]]:
+        """Limits that rows y, (n, m), violate by `tol` of their scale; the amount and the row."""
         violation, owners = -self.find_slack(values), self.owners[self.sides[0]]
         for k, limit in enumerate(self.limits):
             amounts = violation[:, owners == k].max(axis=1, initial=-np.inf)
             worst = int(amounts.argmax())
-            if amounts[worst] > least * limit.scale:
+            if amounts[worst] > tol * limit.scale:
                 yield limit, float(amounts[worst]), worst
 
     @property
     def parameters(self) -> list[Parameter]:
-        """What may be changed to let a motion be planned, each once, those of fingers first."""
+        """Parameters whose change relaxes limits, each once, those of fingers first."""
         parameters = {limit.parameter.key: limit.parameter for limit in self.limits}
         return sorted(
             parameters.values(), key=lambda parameter: not parameter.key.startswith("finger")
@@ -150,12 +150,12 @@ Maker = Callable[[Formation, float], Sequence[MotionLimit]]
 
 def make_limits(formation: Formation, epsilon: float) -> LimitSet:
     """Make the limits of a formation and a least normal force [N]."""
-    made = [limit for maker in MAKERS for limit in maker(formation, epsilon)]
-    return LimitSet(tuple(limit for limit in made if len(limit.low)))
+    limits = [limit for maker in MAKERS for limit in maker(formation, epsilon)]
+    return LimitSet(tuple(limit for limit in limits if len(limit.low)))
 
 
 def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit]:
-    """Contacts press, and what rolls does not slip."""
+    """Limits of normal forces, and friction cones of rolling contacts."""
     parameter = Parameter(EPSILON, epsilon, "N", -1, EPSILON)
     force, n_c, R = formation.scene.scales.force, formation.n_contacts, formation.n_rolling
     H = force_limit_rows(formation)
@@ -165,20 +165,20 @@ def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit
         low, high = epsilon * weight, np.full(len(rows), np.inf)
         return MotionLimit(kind, part, text, "N", rows, low, high, force, parameter, weight)
 
-    least = f"epsilon = {epsilon:g} N"
-    made = [
-        make(PRESS, name, f"c_n of {name} >= {least}", H[k : k + 1], np.ones(1))
+    bound_text = f"epsilon = {epsilon:g} N"
+    limits = [
+        make(PRESS, name, f"c_n of {name} >= {bound_text}", H[k : k + 1], np.ones(1))
         for k, name in enumerate(formation.names)
     ]
     for k, row in enumerate(formation.rolling_rows):
         mu, name = formation.friction[row], formation.names[row]
         text = f"friction cone of {name}, |c_t| <= {mu:g} (c_n - {epsilon:g} N),"
-        made.append(make(CONE, name, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
-    return made
+        limits.append(make(CONE, name, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
+    return limits
 
 
 def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
-    """Torques and speeds of the joints stay within their limits; infinite ones are none."""
+    """Finite limits of torques and speeds of the joints."""
     scene, width = formation.scene, formation.n_contacts + formation.n_rolling + 4
     joint_limits = []
     for kind, unit, first, limits in (
@@ -191,10 +191,10 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
             part, key = f"finger {k + 1}", f"fingers.{k + 1}.{kind}_limit"
             name = f"{kind} limit of {part}"
             parameter = Parameter(name, limit, unit, 1, key)
-            rows, most = np.eye(width)[[first + k]], np.array([limit])
+            rows, high = np.eye(width)[[first + k]], np.array([limit])
             text = f"{name} = {limit:g} {unit}"
             joint_limits.append(
-                MotionLimit(kind, part, text, unit, rows, -most, most, limit, parameter, np.ones(1))
+                MotionLimit(kind, part, text, unit, rows, -high, high, limit, parameter, np.ones(1))
             )
     return joint_limits
 

@@ -272,7 +272,7 @@ class Statics:
         r = [-np.inf, np.inf] if finger is None else [0.0, 0.0]
         bounds = np.vstack([np.stack([np.zeros(4), np.tile(most, 2)], axis=1), r])
         forces = np.column_stack([_TORQUES, np.zeros(5)])
-        return self._solve(none, forces, bounds, cost, least, least, mode, True, cones, within)
+        return self._solve(none, forces, bounds, cost, least, mode, True, cones, within)
 
     def _solve(
         self,
@@ -281,7 +281,6 @@ class Statics:
         bounds: Array,
         cost: Array,
         least: float = 0.0,
-        apex: float = 0.0,
         mode: _Mode | None = None,
         presses: bool = False,
         cones: bool = False,
@@ -290,8 +289,8 @@ class Statics:
         """Linear programme: amounts x of given forces, (5, k), of least cost, (k,), that balance.
 
         They stay within `bounds`, (k, 2), with c_n >= least [N] and, of what sticks, |c_t| <=
-        mu (c_n - apex). All sticks, or a motion begins in a `mode`. `presses` and `cones` add the
-        last of x to `least` and to `apex`. None if there are none.
+        mu (c_n - least). All sticks, or a motion begins in a `mode`. The last of x adds to the
+        former `least` if `presses`, and to the latter with `cones`. None if there are none.
         """
         from scipy.optimize import linprog
 
@@ -313,7 +312,7 @@ class Statics:
         friction = c_t[slides] + (mu * signs[:n_c])[slides, None] * c_n[slides]
         equal = np.vstack([pushes / self._units[:, None], friction / force, mode.rates[still] @ y])
         cone = mu[sticks, None] * (c_n[sticks] - cones * x[-1])
-        edge, motion = apex * mu[sticks], signs[~still, None] * mode.rates[~still] @ y
+        edge, motion = least * mu[sticks], signs[~still, None] * mode.rates[~still] @ y
         rows = [(cone - c_t[sticks]) / force, (cone + c_t[sticks]) / force]
         lows = [edge / force, edge / force, np.zeros(len(motion) + len(mode.opens))]
         rows += [motion, mode.opens @ y]

@@ -1,17 +1,18 @@
 """Plans of all blocks of a problem, one after the other, in the path or the time domain.
 
 Along curves the velocity at the end of a phase is z_s s'. An impact makes it a multiple of the next
-curve's tangent at any speed: v+ = ratio s' z_s. So whether it is possible is known before planning,
-and with a parameter that runs `ratio` times as fast on the next curve the speed is continuous: the
-curves are planned as one. Otherwise the motion has to stop, and the sequence is split. A smooth end
-is passed at speed where the tangents are the same. Under torque rate limits parts are planned one
-after the other, with pauses between them.
+curve's tangent at any speed: v+ = ratio s' z_s. Therefore it is known before planning whether the
+impact is possible. If it is, the curves are planned as one: with a parameter that runs `ratio`
+times as fast on the next curve, the speed is continuous. Otherwise the sequence is split by a stop.
+A smooth end is passed at speed where the tangents are the same. Under torque rate limits parts are
+planned one after the other, with pauses between them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -46,6 +47,7 @@ from .phase_plan import (
     share_duration,
 )
 
+LONG = 4.0  # ratio of a longest duration to the least time above which shorter ones are tried
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -57,7 +59,7 @@ class BlockPlan:
     start: Array  # (5,)
     plans: Plans  # one for each of its phases
     chain: ImpactSequence | None  # its curves; None in the time domain
-    coarse: bool = False  # whether its plans are a guess: they may miss limits between points
+    coarse: bool = False  # whether its plans are a guess that may violate limits between points
 
     @property
     def end(self) -> Array:
@@ -72,25 +74,22 @@ class Planning:
     """The plans of all phases of a problem."""
 
     problem: Problem
-    curves: tuple[Curve, ...]  # of the first phases, as far as ends follow from geometry alone
+    curves: tuple[Curve, ...]  # of the first phases, up to the first end that a plan chooses
     options: PlanOptions
     blocks: tuple[BlockPlan, ...]
-    # [s]: longest duration of each phase for the objective `margin`, in proportion to time-optimal
-    # plans
-    allowed: Sequence[float] = ()
-    least: Plans = field(default_factory=list)  # these plans; blocks end where they do
-    ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
-    # [N]: by how much c_n of blocks, by their indices, have to exceed epsilon, if at all
-    more: dict[int, float] = field(default_factory=dict)
+    durations: Sequence[float] = ()  # [s]: longest one of each phase, for the objective `margin`
+    fastest: Plans = field(default_factory=list)  # time-optimal plans; blocks end where they do
+    free_ends: bool = True  # whether the cost-to-go chooses ends of blocks; not for `margin`
+    extra_epsilon: dict[int, float] = field(default_factory=dict)  # [N]: by indices of blocks
 
     @property
     def plans(self) -> Plans:
-        """One for each phase."""
+        """The plans of all phases."""
         return [plan for block in self.blocks for plan in block.plans]
 
     @cached_property
-    def settled(self) -> Plans:
-        """The plans with dwells at their ends, where the problem asks for these."""
+    def plans_with_dwell(self) -> Plans:
+        """The plans, with dwells at their ends if the problem has some."""
         if all(self.problem.settles(phase) == 0 for phase in self.problem.phases):
             return self.plans
         from .dwell import settle_plans
@@ -99,102 +98,115 @@ class Planning:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """The motion with dwells; of its `meta` only rolling contacts and modes."""
-        pairs = zip(self.settled, self.problem.phases, strict=True)
+        """The motion with dwells; its `meta` has only rolling contacts and modes."""
+        pairs = zip(self.plans_with_dwell, self.problem.phases, strict=True)
         pieces = ((plan.motion, plan.torque, phase.formation) for plan, phase in pairs)
         return assemble_motions(pieces, self.options.samples)
 
-    def allow(self, phases: Sequence[Phase]) -> float | None:
-        """Longest duration of some phases in all [s], for the objective `margin`."""
-        return sum(self.allowed[phase.index] for phase in phases) if self.allowed else None
+    def sum_durations(self, phases: Sequence[Phase]) -> float | None:
+        """Longest duration of successive phases [s], for the objective `margin`."""
+        return sum(self.durations[phase.index] for phase in phases) if self.durations else None
 
 
 def plan_blocks(
     problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
 ) -> Planning:
-    """Plan every block of a problem, each from where the one before ends; raises without a plan.
+    """Plans of all blocks of a problem, each from the end of the previous one; raises without one.
 
-    `curves` are those of the first phases (`trace_phases`); `report` is told what is being done.
+    `curves` are those of the first phases (`trace_phases`); `report` takes progress messages.
     """
     with name_source(problem.source):
         require_steps(problem, options)
     planning = Planning(problem, curves, options, ())
     if options.goal is not Objective.MARGIN:
         return plan_each(planning, report)
-    fast = replace(options, objective=Objective.TIME, duration=None)
-    first = replace(planning, options=fast, ahead=False)
-    least = plan_each(first, report).plans
-    times = [plan.motion.duration for plan in least]
-    longest = 2 * sum(times) if options.duration is None else options.duration
-    return plan_each(replace(planning, allowed=share_duration(times, longest), least=least), report)
+    from .explain import unadvised
+
+    time_options = replace(options, objective=Objective.TIME, duration=None)
+    fastest = plan_each(replace(planning, options=time_options, free_ends=False), report).plans
+    times = [plan.motion.duration for plan in fastest]
+    duration = 2 * sum(times) if options.duration is None else options.duration
+    while True:
+        durations = share_duration(times, duration)
+        slower = replace(planning, durations=durations, fastest=fastest)
+        # Even slower motions hardly press harder, and the NLP may not converge. Case: phase 2 of
+        # the rolling box in 2 s, which takes 0.45 s at least.
+        is_long = duration > LONG * sum(times)
+        try:
+            with unadvised() if is_long else nullcontext():
+                return plan_each(slower, report)
+        except (InfeasibleError, SolverError):
+            if not is_long:
+                raise
+            duration /= 2
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Plan block after block, but for those that are planned and not coarse.
+    """Plan block after block; blocks that already have plans that are not coarse keep these.
 
-    InfeasibleError if a phase cannot keep epsilon in its share of a longest duration.
+    InfeasibleError if a phase cannot keep epsilon in its part of the longest duration.
     """
-    made, count = replace(planning, blocks=()), len(split_blocks(planning.problem))
+    planned, count = replace(planning, blocks=()), len(split_blocks(planning.problem))
     for _, block in zip_longest(range(count), planning.blocks):
-        made = plan_next(made, block, report)
+        planned = plan_next(planned, block, report)
     epsilon = planning.problem.epsilon
     rounding = 5e-7 * planning.problem.scene.scales.force
-    late = planning.options.goal is Objective.MARGIN
-    for phase, plan in zip(planning.problem.phases, made.plans, strict=True):
-        if late and plan.value < epsilon - rounding:
+    bounded = planning.options.goal is Objective.MARGIN
+    for phase, plan in zip(planning.problem.phases, planned.plans, strict=True):
+        if bounded and plan.value < epsilon - rounding:
             raise InfeasibleError(
                 f"phase {phase.number}: in its share of the duration, "
-                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
+                f"{planning.durations[phase.index]:.5g} s, the largest least c_n is "
                 f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
             )
-    return made
+    return planned
 
 
 def plan_next(
-    planning: Planning, known: BlockPlan | None, report: Callable[[str], None], coarse: bool = False
+    planning: Planning, block: BlockPlan | None, report: Callable[[str], None], coarse: bool = False
 ) -> Planning:
-    """Plan the next block, in the time domain coarsely if asked, unless `known` is its plan.
+    """Plan the next block, if `coarse` roughly where it is planned over time.
 
-    A coarse one is the guess.
+    `block` is its plan if it begins in the same place and is not coarse; otherwise its guess.
     """
-    problem, options, least = planning.problem, planning.options, planning.least
+    problem, options, fastest = planning.problem, planning.options, planning.fastest
     phases = split_blocks(problem)[len(planning.blocks)]
     z = planning.blocks[-1].end if planning.blocks else problem.start
     if problem.scene.control_period and planning.blocks and not runs_on_curves(phases):
         z = _replay(planning)
     coarse = coarse and not runs_along_curves(phases, options)
     rounding = 1e-9 * problem.scene.scales.length
-    moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
-    if known is None or moved or known.coarse:
+    moved = block is not None and measure_speed(problem.scene, block.start - z) > rounding
+    if block is None or moved or block.coarse:
         numbers = [phase.number for phase in phases]
         title = f"phase {'-'.join(map(str, numbers))} of {len(problem.phases)}"
         report(f"{title}: {options.goal.value}")
         with name_source(problem.source):
-            more = planning.more.get(len(planning.blocks), 0.0)
-            pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
+            extra = planning.extra_epsilon.get(len(planning.blocks), 0.0)
+            tightened = replace(problem, epsilon=problem.epsilon + extra) if extra else problem
             try:
-                made = plan_block(
-                    replace(planning, problem=pressed),
+                plans, chain = plan_block(
+                    replace(planning, problem=tightened),
                     phases,
                     z,
-                    to_go=look_ahead(planning, phases) if planning.ahead else None,
-                    ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
-                    fastest=[least[phase.index] for phase in phases if least],
-                    begun=known.plans if known and known.coarse else (),
-                    only_begin=coarse,
+                    cost_to_go=find_cost_to_go(planning, phases) if planning.free_ends else None,
+                    saturation=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
+                    fastest=[fastest[phase.index] for phase in phases if fastest],
+                    initial_plans=block.plans if block and block.coarse else (),
+                    coarse=coarse,
                 )
             except WholearmError as error:
                 error.phases = numbers
                 raise
-        known = BlockPlan(phases, z, *made, coarse)
-    return replace(planning, blocks=(*planning.blocks, known))
+        block = BlockPlan(phases, z, plans, chain, coarse)
+    return replace(planning, blocks=(*planning.blocks, block))
 
 
 def _replay(planning: Planning) -> Array:
-    """Where the planned blocks end in their replay, shape (5,); as planned if that fails.
+    """Where the planned blocks end in their replay, shape (5,); as planned if the replay fails.
 
     Motions with several freedoms are unstable in open loop. Case: query 9 with periods of 2 ms,
-    where 2e-6 rad grow 900 times in phase 20.
+    where an error of 2e-6 rad grows 900-fold in phase 20.
     """
     from ..simulation.simulate import simulate
 
@@ -205,23 +217,23 @@ def _replay(planning: Planning) -> Array:
 
 
 def plan_block(
-    planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any
+    planning: Planning, block: Sequence[Phase], z: Array, **arguments: Any
 ) -> tuple[Plans, ImpactSequence | None]:
-    """Plan a block from `z`, along its curves or in the time domain; also its curves.
+    """Plans of a block from `z`, along its curves or in the time domain, and its curves.
 
-    `over_time` are arguments of `plan_with_impacts`.
+    `arguments` are those of `plan_with_impacts`.
     """
     problem, options = planning.problem, planning.options
     if not runs_along_curves(block, options):
-        return _plan_over_time(planning, block, z, over_time), None
+        return _plan_over_time(planning, block, z, arguments), None
     chain = trace_block(planning, block, z)
     if problem.scene.has_slow_motors:
-        return plan_slowly(planning, chain), chain
+        return plan_rate_limited(planning, chain), chain
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
-            longest = planning.allow(part.phases)
-            plans += plan_curves(part.make_task(problem.epsilon, options, longest))
+            duration = planning.sum_durations(part.phases)
+            plans += plan_curves(part.make_task(problem.epsilon, options, duration))
     return plans, chain
 
 
@@ -229,44 +241,45 @@ def trace_block(planning: Planning, block: Sequence[Phase], z: Array) -> ImpactS
     """Curves of a block from `z`, of shape (5,)."""
     stored, curves = planning.curves, list[Curve]()
     for phase in block:
-        known, later = phase.index < len(stored), planning.problem.phases[phase.index + 1 :]
-        curves.append(stored[phase.index] if known else trace_phase(phase, z, later))
+        is_stored, later = phase.index < len(stored), planning.problem.phases[phase.index + 1 :]
+        curves.append(stored[phase.index] if is_stored else trace_phase(phase, z, later))
         z = curves[-1].end
     return ImpactSequence(block, curves)
 
 
 def _plan_over_time(
-    planning: Planning, block: Sequence[Phase], z: Array, over_time: dict[str, Any]
+    planning: Planning, block: Sequence[Phase], z: Array, arguments: dict[str, Any]
 ) -> Plans:
-    """Plans of a block in the time domain, from those with free torques if these are limited.
+    """Plans of a block in the time domain, from those with free torques if motors limit these.
 
-    Under rate limits in the first modes with free torques, then in those of the search: phases 5
-    and 6 of the heptagon have a plan from the former alone, phase 15 of query 28 from the latter.
+    Under rate limits first in the modes of a coarse plan with free torques, then in searched modes:
+    phases 5 and 6 of the heptagon need the former, phase 15 of query 28 the latter.
     """
     from .time_domain.time_plan import plan_with_impacts
 
     problem, options, failure = planning.problem, planning.options, None
-    slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
-    # Coarse plans of the edges of routes are of free torques, others of those of the block.
-    coarse, begun = over_time.get("only_begin", False), over_time.pop("begun", ())
-    of_free, of_block = (begun, ()) if slow and coarse else ((), begun)
-    for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-        first = replace(planning, options=replace(options, mode_search=complete))
-        free = plan_free(first, block, z, begun=of_free, **over_time)
+    limited, duration = problem.scene.has_slow_motors, planning.sum_durations(block)
+    # Coarse plans of the edges of routes have free torques, others the torques of the block.
+    coarse, initial_plans = arguments.get("coarse", False), arguments.pop("initial_plans", ())
+    free_guess, guess = (initial_plans, ()) if limited and coarse else ((), initial_plans)
+    for complete in (False, True) if limited and options.mode_search else (options.mode_search,):
+        variant = replace(planning, options=replace(options, mode_search=complete))
+        free_plans = plan_free(variant, block, z, initial_plans=free_guess, **arguments)
+        guesses: Any = {"free_plans": free_plans, "initial_plans": guess}
         plan: Callable[[float | None], Plans] = partial(
-            plan_with_impacts, problem, block, z, options, free=free, begun=of_block, **over_time
+            plan_with_impacts, problem, block, z, options, **guesses, **arguments
         )
         with charge(block[0].number):
             try:
-                if slow and not coarse:
-                    return plan_with_pauses(planning, block, plan, allowed)
-                return plan(allowed)
+                if limited and not coarse:
+                    return plan_with_pauses(planning, block, plan, duration)
+                return plan(duration)
             except (InfeasibleError, SolverError) as error:
                 failure = failure or error
     from .explain import explain_motors
 
     assert failure is not None
-    raise explain_motors(problem.scene, block, free, failure) from None
+    raise explain_motors(problem.scene, block, free_plans, failure) from None
 
 
 def plan_with_pauses(
@@ -275,17 +288,17 @@ def plan_with_pauses(
     plan: Callable[[float | None], Plans],
     duration: float | None,
 ) -> Plans:
-    """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
+    """Plans of a block in the time domain with pauses, by `plan` for a longest duration [s]."""
     from .dwell import add_pause
 
-    before, scene = planning.plans[-1:], planning.problem.scene
+    previous, scene = planning.plans[-1:], planning.problem.scene
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
-        """From the torques before each phase to its first ones."""
-        lasts = [plan.end_torques[1] for plan in [*before, *plans[:-1]]]
-        firsts = [plan.end_torques[0] for plan in plans]
-        lasts = lasts if before else [firsts[0], *lasts]
-        return [change_torques(scene, *pair) for pair in zip(lasts, firsts, strict=True)]
+        """Changes from the torques before each phase to its first torques."""
+        ends = [plan.end_torques[1] for plan in [*previous, *plans[:-1]]]
+        starts = [plan.end_torques[0] for plan in plans]
+        ends = ends if previous else [starts[0], *ends]
+        return [change_torques(scene, *pair) for pair in zip(ends, starts, strict=True)]
 
     plans = plan(duration)
     changes = list_changes(plans)
@@ -299,26 +312,26 @@ def plan_with_pauses(
     ]
 
 
-def plan_free(planning: Planning, block: Sequence[Phase], z: Array, **over_time: Any) -> Plans:
-    """Plans of a block over time as it would be planned with free torques, maybe along its curves.
+def plan_free(planning: Planning, block: Sequence[Phase], z: Array, **arguments: Any) -> Plans:
+    """Plans with free torques, along curves if possible, of a block that is planned over time.
 
-    None if it is planned so anyway, or asked for over time without a plan along curves.
+    An empty list if the block is planned so itself, or has no plan along curves.
     """
     problem, options = free_torques(planning.problem, planning.options)
     options = replace(options, transcription="auto")
     phases = [problem.phases[phase.index] for phase in block]
-    freed = problem is not planning.problem
-    if not (freed or runs_along_curves(phases, options)):
+    limited = problem is not planning.problem
+    if not (limited or runs_along_curves(phases, options)):
         return []
-    over_time |= {"fastest": ()}
+    arguments |= {"fastest": ()}
     if not planning.problem.scene.control_period:
-        # What holding costs is the difference to an accurate plan.
-        over_time["only_begin"], options = True, options.roughen()
+        # The cost of held torques is the difference to an accurate plan.
+        arguments["coarse"], options = True, options.roughen()
     try:
-        free = replace(planning, problem=problem, options=options, curves=())
-        return plan_block(free, phases, z, **over_time)[0]
+        free_planning = replace(planning, problem=problem, options=options, curves=())
+        return plan_block(free_planning, phases, z, **arguments)[0]
     except WholearmError as error:
-        if not freed:
+        if not limited:
             return []
         from .explain import explain_motors
 
@@ -326,24 +339,24 @@ def plan_free(planning: Planning, block: Sequence[Phase], z: Array, **over_time:
 
 
 def find_following(problem: Problem, block: Sequence[Phase]) -> Sequence[Phase]:
-    """The block after another; none after the last one."""
+    """The next block; empty after the last one."""
     index = block[-1].index + 1
     return next((other for other in split_blocks(problem) if other[0].index == index), ())
 
 
-def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
-    """Cost-to-go of a block in the time domain with a free end on a curve.
+def find_cost_to_go(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
+    """Cost-to-go at the end of a block in the time domain, if that is free on a curve.
 
-    Without limits of motors: its gradient is nearly the same, and soon known.
+    Without motor limits: its gradient is nearly the same, and takes less time.
     """
     problem, options = free_torques(planning.problem, planning.options)
     planning = replace(planning, problem=problem, options=options)
     following = find_following(problem, block)
     if runs_along_curves(block, options) or not following:
         return None
-    phase, ending = following[0], block[-1]
-    gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    lands = gained == {ending.until.contact} and not ending.until.pins
+    phase, last = following[0], block[-1]
+    gained = set(phase.formation.contacts) - set(last.formation.contacts)
+    lands = gained == {last.until.contact} and not last.until.pins
     if options.goal is Objective.MARGIN or not lands or not runs_along_curves(following, options):
         return None
     if options.goal is Objective.TIME and len(following) == 1:
@@ -356,48 +369,48 @@ def look_ahead(planning: Planning, block: Sequence[Phase]) -> CostToGo | None:
 
 
 def estimate_time_to_go(phase: Phase, epsilon: float) -> CostToGo:
-    """Estimated least time [s] of a phase with one freedom, as a function of where it begins."""
+    """Estimated least time [s] of a phase with one freedom, as a function of its start."""
     sequence = partial(ImpactSequence, [phase])
     return CostToGo(phase, lambda z: sequence([trace_phase(phase, z)]).estimate(epsilon))
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
-    """Raise an InputError for combinations with rate-limited or held torques without a planner."""
+    """Raise an InputError for options that exclude rate-limited torques or control periods."""
     settings = [
         (f"{finger.name}.{key}", getattr(finger, key))
         for finger in problem.scene.fingers
-        for key, free in (("torque_rate_limit", math.inf), ("actuator_lag", 0.0))
-        if getattr(finger, key) != free
+        for key, default in (("torque_rate_limit", math.inf), ("actuator_lag", 0.0))
+        if getattr(finger, key) != default
     ]
-    scene, why = problem.scene, ""
+    scene, reason = problem.scene, ""
     if options.ranges:
-        why = "ranges (--robust) are not kept with it yet"
+        reason = "ranges (--robust) are not kept with it yet"
     elif settings and scene.control_hold == "constant":
-        why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
-    if why and scene.control_period:
-        raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
-    along = all(runs_along_curves(block, options) for block in split_blocks(problem))
-    if settings and options.ranges and not along:
-        why = "ranges (--robust) are not kept with it in phases over time yet"
-        raise InputError("", settings[0][0], f"{settings[0][1]:g} given; {why}")
+        reason = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
+    if reason and scene.control_period:
+        raise InputError("", "control_period", f"{scene.control_period:g} given; {reason}")
+    on_curves = all(runs_along_curves(block, options) for block in split_blocks(problem))
+    if settings and options.ranges and not on_curves:
+        reason = "ranges (--robust) are not kept with it in phases over time yet"
+        raise InputError("", settings[0][0], f"{settings[0][1]:g} given; {reason}")
 
 
 def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanOptions]:
-    """The same with free torques."""
+    """The problem and options with free torques."""
     scene = problem.scene
     if scene.control_period:
         options = replace(options, transcription="auto")
     if scene.has_slow_motors or scene.control_period:
-        free = replace(scene.quicken(math.inf), control_period=0.0)
-        problem = replace(problem, scene=free)
+        free_scene = replace(scene.quicken(math.inf), control_period=0.0)
+        problem = replace(problem, scene=free_scene)
     return problem, options
 
 
 @dataclass(frozen=True, eq=False)
 class CurveImpact:
-    """Impact between two curves for unit speed along the first; none if they join smoothly."""
+    """Impact between two curves at unit speed along the first; without impulses if smooth."""
 
-    phase: Phase  # the one that it ends
+    phase: Phase  # that ends
     impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
     ratio: float  # speed along the second curve; negative if the motion would turn back
 
@@ -408,7 +421,7 @@ class CurveImpact:
 
     @property
     def reason(self) -> str:
-        """Why it cannot, empty if it can."""
+        """Why the motion has to stop, empty if not."""
         if self.impact.violations:
             return self.impact.violations[0].describe(PER_SPEED)
         return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
@@ -451,7 +464,7 @@ class ImpactSequence:
 
     @property
     def continuous_curves(self) -> tuple[Curve, ...]:
-        """The curves with such speed ratios that the speed is the same on both sides of a join."""
+        """The curves with speed ratios by which the speed is continuous."""
         ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
         pairs = zip(self.curves, ratios.tolist(), strict=True)
         return tuple(curve.with_speed_ratio(ratio) for curve, ratio in pairs)
@@ -459,7 +472,7 @@ class ImpactSequence:
     def make_task(
         self, epsilon: float, options: PlanOptions, duration: float | None = None
     ) -> Task:
-        """Phases that possible impacts join, from rest to rest."""
+        """The planning task of phases without stops between, from rest to rest."""
         numbers = [phase.number for phase in self.phases]
         return Task(self.continuous_curves, epsilon, options, numbers, duration)
 
@@ -473,7 +486,7 @@ class ImpactSequence:
             raise SolverError(f"phase {number}: no motion keeps the limits") from None
 
     def list_impacts(self, plans: Plans) -> list[Transition]:
-        """The impacts, with the speeds that plans of the phases pass them at."""
+        """The impacts, with their speeds in plans of the phases."""
         impacts = []
         for plan, join in zip(plans, self.impacts, strict=False):
             phase = join.phase
@@ -483,38 +496,38 @@ class ImpactSequence:
         return impacts
 
 
-def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
+def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
     """Plan the parts of a block along curves under rate limits, with pauses between them.
 
-    Torques change in pauses from those of the block before, and to those of the next one.
+    Torques also change in pauses from those of the previous block, and to those of the next one.
     """
     from .dwell import Junction, add_pause, choose_junction
 
     epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
-    # Torques where blocks meet keep the larger epsilon of both. Case: query 41.
-    more = [planning.more.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
-    first_epsilon, last_epsilon = (epsilon + max(other - more[1], 0.0) for other in more[::2])
-    before: Curve | Array | None = None
+    # Torques between blocks keep the larger epsilon of both. Case: query 41.
+    extra = [planning.extra_epsilon.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
+    first_epsilon, last_epsilon = (epsilon + max(other - extra[1], 0.0) for other in extra[::2])
+    previous: Curve | Array | None = None
     if planning.blocks:
         chain, plans_before = planning.blocks[-1].chain, planning.blocks[-1].plans
-        before = chain.curves[-1] if chain else plans_before[-1].end_torques[1]
+        previous = chain.curves[-1] if chain else plans_before[-1].end_torques[1]
     following = find_following(planning.problem, sequence.phases)
-    beyond: Curve | Formation | None = following[0].formation if following else None
+    next_curve: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):
-        beyond = trace_block(planning, following[:1], sequence.curves[-1].end).curves[0]
-    firsts = [*(part.curves[0] for part in parts[1:]), beyond]
+        next_curve = trace_block(planning, following[:1], sequence.curves[-1].end).curves[0]
+    firsts = [*(part.curves[0] for part in parts[1:]), next_curve]
     plans: Plans = []
     junction: Junction | None = None
     for part, after in zip(parts, firsts, strict=True):
         number, first, last = part.phases[0].number, part.curves[0], part.curves[-1]
-        if before is not None and junction is None:
-            junction = choose_junction(before, first, first.start, first_epsilon, number)
-        coming = None
+        if previous is not None and junction is None:
+            junction = choose_junction(previous, first, first.start, first_epsilon, number)
+        ending = None
         if after is not None:
             least = last_epsilon if part is parts[-1] else epsilon
-            coming = choose_junction(last, after, last.end, least, part.phases[-1].number + 1)
-        pins = junction.begins if junction else None, coming.ends if coming else None
-        duration = planning.allow(part.phases)
+            ending = choose_junction(last, after, last.end, least, part.phases[-1].number + 1)
+        pins = junction.start_force if junction else None, ending.end_force if ending else None
+        duration = planning.sum_durations(part.phases)
         if duration is not None and junction is not None:
             duration -= junction.change.duration
         task = replace(part.make_task(epsilon, options, duration), pins=pins)
@@ -523,5 +536,5 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence) -> Plans:
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)
         plans += plan
-        junction, before = coming, last
+        junction, previous = ending, last
     return plans

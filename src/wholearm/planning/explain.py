@@ -1,8 +1,8 @@
 """Diagnosis of phases without a plan: elastic mode, then one relaxation at a time.
 
-All limits are made soft and the shortfalls of the motion of least violation ranked. Then each limit
-alone is relaxed as little as the others allow. Its value is rounded outwards and confirmed by a
-plan: only what was planned is advised.
+With soft limits the shortfalls of the motion of least violation are ranked. Then each limit alone
+is relaxed by as little as the others allow. Its value is rounded outwards and confirmed by a plan:
+only changes with which there is a plan are advised.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves
 from .phase_plan import Piece, Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
-from .time_domain.stage import Stage, blend, make_formation, to_si
+from .time_domain.stage import Stage, bernstein, make_formation, to_si
 from .time_domain.time_motion import make_phase_motions
 
-ADVICE = 100  # iterations of the solver after which no change is tried for phases over time
-HALVINGS = 6  # most of the interval between values with and without a plan
-FRICTION = "friction"  # beginning of the keys of frictions
+ADVICE = 100  # solver iterations after which no change is tried for phases over time
+HALVINGS = 6  # most bisections between values with and without a plan
+FRICTION = "friction"  # prefix of the keys of frictions
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
 E = TypeVar("E", InfeasibleError, JammingError)
 
 
 def unadvised() -> AbstractContextManager[None]:
-    """Have errors say what is missing without looking for changes that would help."""
+    """Context in which errors have no advice: no changes are looked for."""
     return setting(_unadvised, True)
 
 
@@ -72,12 +72,12 @@ def advise(
     parameters: Iterable[Parameter],
     list_values: Callable[[Parameter], Sequence[float] | None],
     replan: Replan | None,
-    most: float = math.inf,
+    max_iter: float = math.inf,
 ) -> E:
-    """Add to an error the changes of a single parameter that make a plan possible.
+    """Add to an error the changes of a single parameter with which there is a plan.
 
-    `list_values` are as of `find_changes`, None where it cannot tell. Without `replan`, and after
-    `most` iterations of solvers, no change is looked for.
+    `list_values` is that of `find_changes`, or returns None if it cannot decide. Without `replan`,
+    and after `max_iter` solver iterations, no change is looked for.
     """
     if replan is None or _unadvised.get():
         return error
@@ -85,11 +85,11 @@ def advise(
     with open_ledger() as ledger:
 
         def is_over(parameter: Parameter) -> bool:
-            over = sum(cost.iterations for cost in ledger.values()) > most
-            undecided.extend([parameter] * over)
-            return over
+            exhausted = sum(cost.iterations for cost in ledger.values()) > max_iter
+            undecided.extend([parameter] * exhausted)
+            return exhausted
 
-        def list_more(parameter: Parameter) -> Sequence[float]:
+        def list_candidates(parameter: Parameter) -> Sequence[float]:
             values = None if is_over(parameter) else list_values(parameter)
             undecided.extend([parameter] * (values is None))
             return values or ()
@@ -103,11 +103,11 @@ def advise(
                 return False
             return True
 
-        error.changes = tuple(find_changes(parameters, list_more, can_plan))
-    text = describe_changes(error.changes)
+        error.changes = tuple(find_changes(parameters, list_candidates, can_plan))
+    advice = describe_changes(error.changes)
     if undecided and not error.changes:
-        text = "no single limit was found that makes it feasible"
-    error.args = (f"{error}; {text}",)
+        advice = "no single limit was found that makes it feasible"
+    error.args = (f"{error}; {advice}",)
     return error
 
 
@@ -118,42 +118,42 @@ def find_changes(
 ) -> list[Change]:
     """Changes of a single parameter with which there is a plan, to values rounded outwards.
 
-    `list_values` returns a value of a parameter without a plan, or NaN, and values to try in order.
+    `list_values` returns a value without a plan, or NaN, then candidates in their order.
     """
     changes = []
     for parameter in parameters:
-        sign, (failed, *values) = parameter.sign, list_values(parameter) or (math.nan,)
+        sign, (infeasible, *values) = parameter.sign, list_values(parameter) or (math.nan,)
         for value in dict.fromkeys(round_outwards(candidate, sign) for candidate in values):
             if value < 0:
                 break
             if value == parameter.value or not can_plan(parameter, value):
-                failed = value
+                infeasible = value
                 continue
-            # As little beyond as plans allow, by bisection.
+            # The least change that allows a plan, by bisection.
             for _ in range(HALVINGS):
-                middle = round_outwards((value + failed) / 2, sign)
-                if not abs(value - failed) > 0.02 * value or middle in (value, failed):
+                middle = round_outwards((value + infeasible) / 2, sign)
+                if not abs(value - infeasible) > 0.02 * value or middle in (value, infeasible):
                     break
-                enough = can_plan(parameter, middle)
-                value, failed = (middle, failed) if enough else (value, middle)
+                feasible = can_plan(parameter, middle)
+                value, infeasible = (middle, infeasible) if feasible else (value, middle)
             changes.append(Change(parameter, value))
             break
     return changes
 
 
-def list_beyond(parameter: Parameter, least: float) -> list[float]:
-    """Values to try from the least one on, with which limits at the nodes can just be kept.
+def list_beyond(parameter: Parameter, limit: float) -> list[float]:
+    """Candidates from `limit` on, the least change with which limits hold at the nodes.
 
-    Plans keep limits between nodes too.
+    Plans satisfy limits between nodes, too.
     """
-    shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
-    return [math.nan, *(least * (1 + parameter.sign * share) for share in shares)]
+    fractions = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
+    return [math.nan, *(limit * (1 + parameter.sign * fraction) for fraction in fractions)]
 
 
 def change_scene(scene: Scene, key: str, value: float) -> Scene:
     """The scene with another value of a parameter, such as `fingers.1.torque_limit`."""
-    where, *names = key.split(".")
-    if where == FRICTION:
+    part, *names = key.split(".")
+    if part == FRICTION:
         return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
     change: Any = {names[1]: value}
     fingers = dict(zip("12", scene.fingers, strict=True))
@@ -177,37 +177,37 @@ def change_limit(problem: Problem, key: str, value: float) -> Problem:
 def find_shortfalls(
     limits: LimitSet, values: Array, places: Sequence[LimitPlace]
 ) -> list[Shortfall]:
-    """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
+    """Largest violation of each limit and its place, from values of the rows, (n, m)."""
     shortfalls = []
-    for limit, amount, worst in limits.list_misses(values, 1e-4):  # least miss that counts
-        what = limit.kind, limit.part, limit.text, amount, limit.unit
-        shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
+    for limit, amount, k in limits.list_violated(values, 1e-4):  # least violation that counts
+        kind, part, share = limit.kind, limit.part, amount / limit.scale
+        shortfalls.append(Shortfall(kind, part, limit.text, amount, limit.unit, places[k], share))
     return shortfalls
 
 
 def rank(
     phases: Sequence[int], shortfalls: Iterable[Shortfall], motion: Trajectory | None
 ) -> InfeasibleError:
-    """The error for phases with a motion of least violation: shortfalls, the worst first."""
-    ranked = sorted(shortfalls, key=lambda short: -short.share)
+    """The error for phases with a motion of least violation; the worst shortfall comes first."""
+    ranked = sorted(shortfalls, key=lambda shortfall: -shortfall.share)
     text = f"{name_phases(phases, 'infeasible')}: {'; '.join(map(str, ranked))}"
     return InfeasibleError(text, ranked, (), motion)
 
 
-def explain_curves(task: Task, stopped: str) -> WholearmError:
-    """Why phases along curves have no plan, and what would change that.
+def explain_curves(task: Task, status: str) -> WholearmError:
+    """The error for phases along curves without a plan, with changes that allow one.
 
-    Torque rate limits, or else limits of which the least violation is found with soft ones.
-    `stopped` says in words how the solver ended.
+    It names torque rate limits, or the shortfalls of the elastic problem. `status` says how the
+    solver ended.
     """
     if task.is_held:
-        return _explain_rate_limits(task, stopped)
+        return _explain_rate_limits(task, status)
     try:
         elastic = PathIterate.elastic(task).solve()
     except SolverError:
-        return SolverError(stopped)
+        return SolverError(status)
     data, parts = elastic.data, elastic.parts
-    pieces, shortfalls, missing = list[Piece](), list[Shortfall](), None
+    pieces, shortfalls, trajectory = list[Piece](), list[Shortfall](), None
     for part, motion, phase in zip(parts, elastic.motions, task.phases, strict=True):
         suffix = f", phase {phase}" if len(parts) > 1 else ""
         nodes = zip(motion.times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True)
@@ -217,12 +217,12 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         values = part.evaluate(part.nodes, motion.profile)
         shortfalls += find_shortfalls(part.limits, values, places)
     if not shortfalls:
-        text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
+        text = f"{status} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
-    may_change = [*data.speeds.parameters, *data.limits.parameters]
+    parameters = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:
-        # Velocities after impacts between phases would depend on friction too.
-        may_change += list_frictions(data.curve.formation)
+        # With several phases velocities after impacts depend on friction, too.
+        parameters += list_frictions(data.curve.formation)
 
     def list_values(parameter: Parameter) -> Sequence[float]:
         if parameter.key.startswith(FRICTION):
@@ -230,39 +230,39 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         least = _find_least(task, parameter)
         return () if least is None else list_beyond(parameter, least)
 
-    with suppress(SolverError):  # it stalls
+    with suppress(SolverError):  # the motion stalls
         for part, motion in zip(parts, elastic.motions, strict=True):
             pieces.append((motion, fit_torque(part, motion), part.curve.formation))
-        missing = assemble_motions(pieces, 201, status="misses limits least")
-    error = rank(task.phases, shortfalls, missing)
-    return advise(error, may_change, list_values, partial(_replan_task, task))
+        trajectory = assemble_motions(pieces, 201, status="misses limits least")
+    error = rank(task.phases, shortfalls, trajectory)
+    return advise(error, parameters, list_values, partial(_replan_task, task))
 
 
 def _change_task(task: Task, parameter: Parameter, value: float) -> Task:
-    """Planning along the same curves with another value of a parameter."""
+    """The task on the same curves with another value of a parameter."""
     if parameter.key == EPSILON:
         return replace(task, epsilon=value)
     return replace(task, curves=[change_curve(c, parameter.key, value) for c in task.curves])
 
 
 def _find_least(task: Task, parameter: Parameter) -> float | None:
-    """The value of a parameter next to its own with which a speed sweep finds a motion, to 0.3 %.
+    """Value of a parameter nearest to its own with which a speed sweep finds a motion, to 0.3 %.
 
-    By bisection, up to a thousand times its own or down to zero; None if there is none.
+    By bisection, up to a thousand times its value or down to zero; None if there is none.
     """
-    rises = parameter.sign > 0
-    failed, least = parameter.value, 1e3 * parameter.value if rises else 0.0
+    increases = parameter.sign > 0
+    infeasible, least = parameter.value, 1e3 * parameter.value if increases else 0.0
     if _change_task(task, parameter, least).find_fastest() is None:
         return None
-    while abs(least - failed) > 0.003 * max(least, 0.01 * failed):
-        middle = math.sqrt(failed * least) if rises else (failed + least) / 2
-        enough = _change_task(task, parameter, middle).find_fastest() is not None
-        least, failed = (middle, failed) if enough else (least, middle)
+    while abs(least - infeasible) > 0.003 * max(least, 0.01 * infeasible):
+        middle = math.sqrt(infeasible * least) if increases else (infeasible + least) / 2
+        feasible = _change_task(task, parameter, middle).find_fastest() is not None
+        least, infeasible = (middle, infeasible) if feasible else (least, middle)
     return least
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
-    """Plan along the same curves with another value of a parameter, roughly, and all else anew."""
+    """Plan along the same curves with another value of a parameter, at low accuracy."""
     task = _change_task(task, parameter, value)
     if task.find_fastest() is None:
         raise SolverError("no motion keeps the limits")
@@ -271,34 +271,34 @@ def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
 
 
 def list_frictions(formation: Formation) -> list[Parameter]:
-    """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
+    """Friction coefficients of a formation: to lower, and where a contact rolls also to raise."""
     parts = dict.fromkeys(contact.finger for contact in formation.contacts)
-    rolls = {contact.finger for contact in formation.rolling}
+    rolling_parts = {contact.finger for contact in formation.rolling}
     frictions = []
     for finger in parts:
         name = "palm" if finger is None else f"finger {finger + 1}"
         key, value = f"{FRICTION}.{name.replace(' ', '')}", formation.scene.friction.of(finger)
-        signs = (-1, 1) if finger in rolls else (-1,)
+        signs = (-1, 1) if finger in rolling_parts else (-1,)
         frictions += [Parameter(f"friction of {name}", value, "", sign, key) for sign in signs]
     return frictions
 
 
 def list_frictions_to_try(parameter: Parameter) -> tuple[float, float]:
-    """The coefficient without a plan, and the lowest or a high one."""
+    """The coefficient, without a plan, and zero or a high coefficient."""
     return parameter.value, 0.0 if parameter.sign < 0 else 4.0 * parameter.value
 
 
 def explain_jam(task: Task, jam: JammingError) -> JammingError:
-    """Add to an error which single lower friction would let a phase be planned."""
-    lower = [friction for friction in list_frictions(task.curves[0].formation) if friction.sign < 0]
-    return advise(jam, lower, list_frictions_to_try, partial(_replan_task, task))
+    """Add to an error the single lower frictions with which a phase has a plan."""
+    parameters = [p for p in list_frictions(task.curves[0].formation) if p.sign < 0]
+    return advise(jam, parameters, list_frictions_to_try, partial(_replan_task, task))
 
 
 def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
-    """The error for phases without a plan under rate limits and lags.
+    """The error for phases without a plan under rate limits and lag.
 
-    It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
-    are tried.
+    If there is no plan with unlimited rates either, it is the error of these. Otherwise larger
+    limits are tried.
     """
     scene = task.curves[0].formation.scene
     parts = task.lay_out()
@@ -316,31 +316,31 @@ def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
         return error
     for factor in (2.0, 10.0, 100.0):
         with suppress(WholearmError):
-            quick = plan(scene.quicken(factor), task.pins, explained=False)
-            return refuse_motors(scene, quick, task.phases, reason)
+            relaxed = plan(scene.quicken(factor), task.pins, explained=False)
+            return refuse_motors(scene, relaxed, task.phases, reason)
     return refuse_motors(scene, None, task.phases, reason)
 
 
-# Keys of motors and control periods with units, and signs of changes that let torques change faster
+# Keys of motors and control periods: unit, and sign of a change that allows faster torque changes
 MOTORS = {"torque_rate_limit": ("N m/s", 1), "actuator_lag": ("s", -1), "control_period": ("s", -1)}
 
 
 def _list_motors(scene: Scene) -> list[tuple[str, float]]:
-    """Keys and values of what limits changes of the torques."""
+    """Keys and values of all limits of torque changes."""
     *keys, period = MOTORS
     limits = [(key, getattr(finger, key)) for key in keys for finger in scene.fingers]
     return [*limits, (period, scene.control_period)]
 
 
 def refuse_motors(
-    scene: Scene, quick: Scene | None, phases: Sequence[int], reason: str = "", tried: str = ""
+    scene: Scene, relaxed: Scene | None, phases: Sequence[int], reason: str = "", attempt: str = ""
 ) -> InfeasibleError:
-    """The error for phases without a plan with the torques that motors or control periods allow.
+    """The error for phases without a plan under motor limits or control periods.
 
-    There is a plan in the scene `quick`; None if only with free torques, and none as `tried`.
+    There is a plan in the scene `relaxed`; None: only with free torques, and none with `attempt`.
     """
     changes = dict[Change, None]()
-    pairs = zip(_list_motors(scene), _list_motors(quick or scene), strict=True)
+    pairs = zip(_list_motors(scene), _list_motors(relaxed or scene), strict=True)
     for (key, value), (_, other) in pairs:
         if value != other:
             unit, sign = MOTORS[key]
@@ -348,7 +348,7 @@ def refuse_motors(
             changes[change] = None
     text = f"{name_phases(phases, 'infeasible')}: torques may not change as quickly as they would "
     advice = f"feasible with {' and '.join(map(str, changes))}"
-    free = "a plan was found with free torques" + f", and none with {tried}" * bool(tried)
+    free = "a plan was found with free torques" + f", and none with {attempt}" * bool(attempt)
     text += f"have to; {advice if changes else free}"
     text += f"; {reason}" * bool(reason)
     return InfeasibleError(text, changes=changes if len(changes) == 1 else ())
@@ -357,14 +357,14 @@ def refuse_motors(
 def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -> None:
     """Raise an InfeasibleError if no motion can begin from rest, or come to rest at the end.
 
-    The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
-    for `advise`.
+    The end counts if it is a single point, as of one phase with one degree of freedom. `replan` is
+    that of `advise`.
     """
     problem, phases = search.source, search.phases
     epsilon, last, phase = search.problem.epsilon, stages[-1], phases[0]
-    alone = len(phases) == 1 and not phase.until.is_release
-    one_end = alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1
-    for stage, node in [(stages[0], 0), *[(last, -1)] * one_end]:
+    single = len(phases) == 1 and not phase.until.is_release
+    fixed_end = single and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1
+    for stage, node in [(stages[0], 0), *[(last, -1)] * fixed_end]:
         statics = Statics(stage.formation, stage.guess.nodes[node, 0])
         if blocked := statics.find_block(epsilon, ends=node == -1):
             break
@@ -372,10 +372,10 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
         first, text = stages[0].formation, ""
         names = " ".join(first.names)
         z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
-        if alone and [contact.finger for contact in first.contacts] == [None, None]:
+        if single and [contact.finger for contact in first.contacts] == [None, None]:
             text = f"no finger drives the object on {names}, and it stays at rest; add a contact "
             text += "with a finger"
-        elif alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+        elif single and first.n_constraints <= 2 and pushes_one_way(first, z):
             text = f"{names} can only push the object one way, with whatever friction, so that it "
             where = describe_pose(to_si(last, problem).guess.nodes[-1, 0])
             text += f"does not come to rest at its end, {where}"
@@ -384,16 +384,16 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     fails = "no motion comes to rest" if node else "no motion begins"
-    at = "at its end" if node else "from rest at its start"
-    text = f"phase {phase.number} is infeasible: {at}, {where}, {fails} in any contact mode"
+    place = "at its end" if node else "from rest at its start"
+    text = f"phase {phase.number} is infeasible: {place}, {where}, {fails} in any contact mode"
     shortfalls = list[Shortfall]()
     if blocked.contact:
-        amount = blocked.short * problem.scene.scales.force
-        limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
+        contact, share = blocked.contact, blocked.short
+        amount = share * problem.scene.scales.force
+        limit = f"c_n of {contact} >= epsilon = {problem.epsilon:g} N"
         text += f": {limit} is {amount:.3g} N short at best"
-        what = PRESS, blocked.contact, limit, amount, "N"
-        place = LimitPlace(phase.number, math.nan, where)
-        shortfalls.append(Shortfall(*what, place, blocked.short))
+        limit_place = LimitPlace(phase.number, math.nan, where)
+        shortfalls.append(Shortfall(PRESS, contact, limit, amount, "N", limit_place, share))
     else:
         text += " within the torque limits"
 
@@ -412,9 +412,9 @@ def refuse(search: TimeSearch, stages: Sequence[Stage], replan: Replan | None) -
 
 
 def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
-    """Raise an InfeasibleError if no torques hold the object at rest at both ends of phases.
+    """Raise an InfeasibleError if no continuous torques hold the object at both ends of phases.
 
-    Torques may not step. The end counts if it is one point; it has to be reached by such torques.
+    The end counts if it is a single point; a motion with such torques has to reach it.
     """
     problem, phases = search.source, search.phases
     ends = [(phases[0], to_si(stages[0], problem), 0)]
@@ -422,19 +422,19 @@ def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
         ends.append((phases[-1], to_si(stages[-1], problem), -1))
     may_not = "torques may not step (torque_rate_limit, actuator_lag)"
     for phase, stage, node in ends:
-        own = stage.formation
-        touching = stage.ending if node else own
+        formation = stage.formation
+        at_rest = stage.ending if node else formation
         z, limit = stage.guess.nodes[node, 0], problem.scene.torque_limit
-        held = Statics(make_formation(own.scene, touching.contacts), z).torque_polygon()
+        static = Statics(make_formation(formation.scene, at_rest.contacts), z).torque_polygon()
         moving = Statics(phase.formation, z)
         text = f"phase {phase.number} is infeasible: {may_not}"
         where = f"{'end' if node else 'start'}, {describe_pose(z)}"
-        names, advice = " ".join(touching.names), "or leave out torque_rate_limit and actuator_lag"
-        if held.is_empty(limit):
-            most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+        names, advice = " ".join(at_rest.names), "or leave out torque_rate_limit and actuator_lag"
+        if static.is_empty(limit):
+            size = "however large" if static.is_empty(np.full(2, np.inf)) else "within their limits"
             raise InfeasibleError(
                 f"{text}, so that they have to hold the object at rest at its {where}; {names} "
-                f"with their friction can be held there by no torques, {most}; end the phase where "
+                f"with their friction can be held there by no torques, {size}; end the phase where "
                 f"they can (wholearm predict shows where), {advice}"
             )
         if node == 0 and moving.list_continuous(problem.epsilon) == []:
@@ -443,80 +443,81 @@ def require_hold_at_ends(search: TimeSearch, stages: Sequence[Stage]) -> None:
                 f"{problem.epsilon:g} N on {names} and the torque limits exclude balance on the "
                 "verge of all; leave out torque_rate_limit and actuator_lag"
             )
-        if touching is not own and moving.list_continuous(problem.epsilon, held) == []:
+        if at_rest is not formation and moving.list_continuous(problem.epsilon, static) == []:
             raise InfeasibleError(
                 f"{text}, and none that bring it to rest at its {where}, and keep c_n >= "
                 f"{problem.epsilon:g} N until then, hold the object there on {names}; end it "
-                f"elsewhere{_find_holds(phase, touching, z, problem.epsilon)}, {advice}"
+                f"elsewhere{_find_holds(phase, at_rest, z, problem.epsilon)}, {advice}"
             )
 
 
-def _find_holds(phase: Phase, touching: Formation, z: Array, epsilon: float) -> str:
-    """Ends of a phase beside z, (5,), on a curve, at which torques that do not step can hold."""
+def _find_holds(phase: Phase, at_rest: Formation, z: Array, epsilon: float) -> str:
+    """Text with the ends of a phase along a curve through z, (5,), where torques can hold."""
     places = list[float]()
-    for heading in find_headings(touching, z) if touching.n_constraints == 4 else ():
-        curve = trace_curve(touching, z, heading, Until())
+    for heading in find_headings(at_rest, z) if at_rest.n_constraints == 4 else ():
+        curve = trace_curve(at_rest, z, heading, Until())
         for end in curve.evaluate(np.linspace(0.0, curve.length, 25)).z:
-            held = Statics(touching, end).torque_polygon()
-            if Statics(phase.formation, end).list_continuous(epsilon, held):
+            static = Statics(at_rest, end).torque_polygon()
+            if Statics(phase.formation, end).list_continuous(epsilon, static):
                 places.append(1e3 * end[0])
     return f" (they can for x of {min(places):.3g} to {max(places):.3g} mm)" if places else ""
 
 
 def refuse_paths(search: TimeSearch, margins: Sequence[PathMargin]) -> None:
-    """Raise an InfeasibleError with the critical limit if along every path one is missed."""
+    """Raise an InfeasibleError with the critical limit if every path violates a limit."""
     number = search.phases[0].number
     if not margins or (best := max(margins, key=lambda margin: margin.value)).value > -0.02:
         return
-    limit, missed, place = best.limit, -best.value, LimitPlace(number, math.nan, "the best of them")
-    what = limit.kind, limit.part, limit.text, missed * limit.scale, limit.unit
-    shortfall = Shortfall(*what, place, missed)
+    limit, violation = best.limit, -best.value
+    place = LimitPlace(number, math.nan, "the best of them")
+    kind, part, amount = limit.kind, limit.part, violation * limit.scale
+    shortfall = Shortfall(kind, part, limit.text, amount, limit.unit, place, violation)
     text = f"phase {number} is infeasible along all straight paths to its ends, at any speed: "
     raise InfeasibleError(f"{text}{shortfall}", [shortfall])
 
 
 def explain_stages(
     search: TimeSearch,
-    short: Sequence[list[Stage]],
+    infeasible: Sequence[list[Stage]],
     replan: Replan | None,
-    missed: Sequence[Shortfall] = (),
+    violations: Sequence[Shortfall] = (),
 ) -> InfeasibleError | SolverError:
-    """Why phases over time have no plan, and what would change that.
+    """The error for phases over time without a plan, with changes that allow one.
 
-    `short` are elastic solutions that violate limits, from different guesses; without any, `missed`
-    are violations where the last elastic solve stopped. Without `replan` no change is looked for.
+    `infeasible` are elastic solutions that violate limits, from different guesses. Without any,
+    `violations` are those where the last elastic solve stopped. `replan` is that of `advise`.
     """
     problem, phases, numbers = search.source, search.phases, search.numbers
-    if not short:
+    if not infeasible:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         where = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until})"
         text = f"{where}: the solver found neither a plan nor a motion that misses limits least"
-        if missed:
-            worst = max(missed, key=attrgetter("share"))
+        if violations:
+            worst = max(violations, key=attrgetter("share"))
             text += f"; where it stopped, {worst}"
-        usual = search.options.transcription == "time" and not problem.scene.control_period
-        if usual and runs_along_curves(phases, PlanOptions()):
+        over_time = search.options.transcription == "time" and not problem.scene.control_period
+        if over_time and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
-    pairs = [(stages, list_shortfalls(search, stages)) for stages in short]
-    nearest, shortfalls = min(pairs, key=lambda pair: sum(one.amount for one in pair[1]))
-    stages = [to_si(stage, problem) for stage in nearest]
+    pairs = [(stages, list_shortfalls(search, stages)) for stages in infeasible]
+    best, shortfalls = min(pairs, key=lambda pair: sum(shortfall.amount for shortfall in pair[1]))
+    stages = [to_si(stage, problem) for stage in best]
 
     def list_values(parameter: Parameter) -> Sequence[float] | None:
-        # The limit has to be active; epsilon if no normal force is short of more than that.
+        # The limit has to be active; epsilon counts if all normal forces are positive.
         if parameter.key == EPSILON:
-            pressing = (one for one in shortfalls if one.kind == PRESS)
-            active = all(one.amount < parameter.value for one in pressing)
+            pressing = (shortfall for shortfall in shortfalls if shortfall.kind == PRESS)
+            active = all(shortfall.amount < parameter.value for shortfall in pressing)
         else:
             parts = [stage.guess for stage in stages]
             tables = (part.v[..., 3:] if parameter.is_speed else part.tau for part in parts)
-            most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
-            active = most > 0.98 * parameter.value  # share of a limit above which it is active
+            peak = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
+            active = peak > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
             return None
-        solution = search.soften(parameter).solve(nearest)
-        # A limit that may be tighter is not in conflict with the others.
+        solution = search.soften(parameter).solve(best)
+        # A limit that may be tighter does not conflict with the others.
         if not solution.success or solution.cost < 0.0:
             return None
         unit = _unit_of(parameter, problem.scene.scales)
@@ -524,32 +525,32 @@ def explain_stages(
 
     motions = zip(make_phase_motions(stages, search.scheme), phases, strict=True)
     pieces = ((motion, motion.torque, phase.formation) for motion, phase in motions)
-    missing = assemble_motions(pieces, 201, status="misses limits least")
+    trajectory = assemble_motions(pieces, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    error = rank(numbers, shortfalls, missing)
+    error = rank(numbers, shortfalls, trajectory)
     return advise(error, parameters, list_values, replan, ADVICE)
 
 
 def list_shortfalls(search: TimeSearch, stages: Sequence[Stage]) -> list[Shortfall]:
-    """Violations of limits by the motion of stages in the scene's units, each where it is worst.
+    """Largest violation of each limit by stages in the scene's units, in SI units.
 
-    They are looked at in SI units, at the collocation points, torques also at ends of intervals.
+    Checked at the collocation points, torques also at the ends of intervals.
     """
     problem, scheme = search.source, search.scheme
-    worst, passed = dict[str, Shortfall](), 0.0
-    pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
-    at = np.concatenate([[0.0], scheme.points, [1.0]])
+    worst, start_time = dict[str, Shortfall](), 0.0
+    indices = np.array([0, *range(scheme.degree), scheme.degree - 1])
+    x = np.concatenate([[0.0], scheme.points, [1.0]])
     for stage in (to_si(stage, problem) for stage in stages):
         limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
-        tau = blend(at, part.tau.shape[1]) @ part.tau
-        y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
-        middles = passed + np.cumsum(part.h) - part.h / 2
-        number, times = stage.phase + 1, np.repeat(middles, len(pick)).tolist()
+        tau = bernstein(x, part.tau.shape[1]) @ part.tau
+        y = np.concatenate([part.forces[:, indices], tau, part.v[:, indices, 3:]], axis=2)
+        middles = start_time + np.cumsum(part.h) - part.h / 2
+        number, times = stage.phase + 1, np.repeat(middles, len(indices)).tolist()
         places = [LimitPlace(number, t, f"t = {t:.4f} s, phase {number}") for t in times]
         values = (y @ limits.rows.T).reshape(-1, len(limits.low))
-        for short in find_shortfalls(limits, values, places):
-            worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)
-        passed += part.duration
+        for new in find_shortfalls(limits, values, places):
+            worst[new.limit] = max(worst.get(new.limit, new), new, key=lambda s: s.amount)
+        start_time += part.duration
     return list(worst.values())
 
 
@@ -566,7 +567,7 @@ def _unit_of(parameter: Parameter, scales: Scales) -> float:
 def explain_motors(
     scene: Scene, block: Sequence[Phase], free: Plans, error: WholearmError
 ) -> WholearmError:
-    """The error for phases that have the plans `free` with free torques, or none."""
+    """The error for phases under motor limits; `free` are their plans with free torques, if any."""
     settings = list[str]()
     for key, group in groupby(_list_motors(scene), key=itemgetter(0)):
         values = dict.fromkeys(value for _, value in group)
@@ -578,7 +579,7 @@ def explain_motors(
     keys, where = " and ".join(settings), name_phases([phase.number for phase in block])
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
-    lasts = sum(plan.motion.duration for plan in free)
-    text = f"without {keys} there is a plan of about {lasts:.2g} s for {where}; with that, {error}"
+    time = sum(plan.motion.duration for plan in free)
+    text = f"without {keys} there is a plan of about {time:.2g} s for {where}; with that, {error}"
     error.args = (text if free else f"{error}; so it is without {keys}",)
     return error

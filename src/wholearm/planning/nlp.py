@@ -124,7 +124,7 @@ def _identify(*args: Any) -> tuple[Any, ...]:
     return tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
 
 
-share = stored(_identify, most=64)
+share = stored(_identify, max_size=64)
 """Has a function keep its last kernels, each for all formations with the same equations."""
 
 

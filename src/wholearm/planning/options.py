@@ -18,8 +18,8 @@ class Objective(Enum):
     TIME = "time"  # least duration
     EFFORT = "effort"  # least integral of tau^T tau, plus a weight on time
     MARGIN = "margin"  # largest least normal force within a given duration
-    ELASTIC = "elastic"  # least shortfall of the limits; used to explain why there is no plan
-    RELAX = "relax"  # least relaxation of one limit; used to say what would make a plan possible
+    ELASTIC = "elastic"  # least shortfall of the limits, for the diagnosis without a plan
+    RELAX = "relax"  # least relaxation of one limit, for advice
 
 
 PLANNER = """\
@@ -46,7 +46,7 @@ PLANNER = """\
 --largest           also look for the largest factor with which there is a plan
 --certify           bound the least time along curves from below, and print the gap
 """
-"""What takes more than these ranges takes memory or hours for nothing."""
+"""Values beyond these ranges take memory or hours without use."""
 _FIELDS = [option.field for option in read_options(PLANNER)]
 _DEFAULTS: dict[str, Any] = {option.name: option.default for option in _FIELDS}
 DEFAULT_ACCURACY: float = _DEFAULTS["accuracy"]
@@ -99,7 +99,7 @@ class PlanOptions:
             raise InputError("", "largest", "is for robust plans only")
 
     def scale_ranges(self, given: Mapping[str, float], factor: float | None = None) -> PlanOptions:
-        """The same with ranges of so many times a problem's own, or as many as `robust` says."""
+        """Copy with `factor` times a problem's ranges, by default `robust` times."""
         from ..problem.definition import PARAMETERS, read_widths
 
         factor = self.robust if factor is None else factor
@@ -112,7 +112,7 @@ class PlanOptions:
         return replace(self, ranges=ranges)
 
     def roughen(self) -> PlanOptions:
-        """The same for plans that only have to exist."""
+        """Copy with low accuracy, for plans that only have to exist."""
         return replace(self, accuracy=max(self.accuracy, 1e-2))
 
     @property

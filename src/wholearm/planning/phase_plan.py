@@ -11,7 +11,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.document import plain
+from ..common.document import to_plain
 from ..common.errors import Change, InfeasibleError, Parameter, describe_changes, round_outwards
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curves
@@ -32,10 +32,10 @@ class PhasePlan(NamedTuple, Generic[M_co]):
 
     motion: M_co
     torque: TorqueProfile  # from the start of the phase
-    value: float  # the phase's share of the objective: s, (N m)^2 s or N
-    sequences: int = 0  # of contact modes tried, in the first phase of an NLP; 0 on curves
-    complete: bool = True  # whether the mode search has tried all neighbours
-    attempt: str = ""  # name of its initial guess; none along curves
+    value: float  # the phase's part of the objective: s, (N m)^2 s or N
+    sequences: int = 0  # of contact modes solved, in the first phase of an NLP; 0 on curves
+    complete: bool = True  # whether the mode search has solved all neighbours
+    attempt: str = ""  # name of its initial guess; empty along curves
     stages: Sequence[object] = ()  # of the NLP, in the scene's units; none along curves
     error: float = math.nan  # estimated relative error of the value of all phases in one NLP
     unheld: float = math.nan  # value with free torques, where they are held over control periods
@@ -50,7 +50,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
 Plans = list[PhasePlan[Motion]]
 PlanPart = Callable[[int, int, Array, PlanOptions, float | None], Plans]
 """Plans phases `start` to `stop` of a block, without the latter, from a configuration and within a
-duration: from rest to rest, with what joins them passed in motion."""
+duration: from rest to rest, without stops between."""
 
 
 def combine(goal: Objective, values: Sequence[float]) -> float:
@@ -70,11 +70,11 @@ Piece = tuple[Motion, TorqueProfile, Formation]
 
 
 def assemble_motions(pieces: Iterable[Piece], rows: int, **meta: Any) -> Trajectory:
-    """The trajectory of phases; of its `meta` rolling contacts and modes are added."""
+    """The trajectory of phases; rolling contacts and modes are added to its `meta`."""
     motions, torques, formations = zip(*pieces, strict=True)
     entries: dict[str, Any] = {
         "rolling": [[contact.name for contact in formation.rolling] for formation in formations],
-        "modes": plain([getattr(motion, "modes", ()) for motion in motions]),
+        "modes": to_plain([getattr(motion, "modes", ()) for motion in motions]),
     }
     return assemble(motions, TorqueProfile.chain(torques), entries | meta, rows)
 
@@ -86,29 +86,29 @@ def plan_stops(
     options: PlanOptions,
     duration: float | None = None,
 ) -> Plans:
-    """Plan phases of a block with a stop before some of them; raises without a plan.
+    """Plans of phases of a block with a stop before some of them; raises without a plan.
 
     Parameters
     ----------
     bounds          indices in the block of the phases that start at rest, and the end of the last
     z : (5,)        start
-    duration : [s]  longest in all, for `margin`: shared in proportion to the parts' least times
+    duration : [s]  longest in all, for `margin`: divided in proportion to the parts' least times
     """
     parts = list(pairwise(bounds))
 
-    def plan_parts(options: PlanOptions, allowed: Sequence[float | None]) -> Plans:
+    def plan_parts(options: PlanOptions, durations: Sequence[float | None]) -> Plans:
         plans, begin = list[PhasePlan[Motion]](), z
-        for (start, stop), longest in zip(parts, allowed, strict=True):
+        for (start, stop), longest in zip(parts, durations, strict=True):
             plans += plan_part(start, stop, begin, options, longest)
             begin = end_of(plans[-1])[0]
         return plans
 
     if duration is None or len(parts) == 1:
         return plan_parts(options, [duration] * len(parts))
-    fastest = replace(options, objective=Objective.TIME, duration=None)
-    least = plan_parts(fastest, [None] * len(parts))
+    time_options = replace(options, objective=Objective.TIME, duration=None)
+    time_optimal = plan_parts(time_options, [None] * len(parts))
     times = [
-        sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
+        sum(plan.motion.duration for plan in time_optimal[start - bounds[0] : stop - bounds[0]])
         for start, stop in parts
     ]
     stops = "a stop" if len(parts) == 2 else "stops"
@@ -120,17 +120,17 @@ def share_duration(
 ) -> list[float]:
     """Durations of parts in proportion to their least times [s].
 
-    InfeasibleError if they are too short, `where` and with `stops` that are not in the problem.
+    InfeasibleError if the duration is too short; it names `stops` that are not in the problem.
     """
-    least = sum(times)
-    if duration <= least:
-        # The least-time plan shows it; a little more leaves something to choose.
+    least_time = sum(times)
+    if duration <= least_time:
+        # The least time is feasible; a little more leaves a margin to optimize.
         parameter = Parameter("duration", duration, "s", 1, "duration")
-        changes = [Change(parameter, round_outwards(1.005 * least, 1))] * (not stops)
+        changes = [Change(parameter, round_outwards(1.005 * least_time, 1))] * (not stops)
         text = f"{where}duration = {duration:g} s is not longer than the least time{stops}, "
-        text += f"{least:.6g} s" + (f"; {describe_changes(changes)}" if changes else "")
+        text += f"{least_time:.6g} s" + (f"; {describe_changes(changes)}" if changes else "")
         raise InfeasibleError(text, changes=changes)
-    return [duration / least * time for time in times]
+    return [duration / least_time * time for time in times]
 
 
 def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
@@ -147,7 +147,7 @@ def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
 def make_transition(
     phase: Phase, impact: Impact, ratio: float, reason: str, speed: float
 ) -> Transition:
-    """The transition at the end of a phase; what it saves is not known yet."""
-    contact, impulse = impact.least
-    what = phase.number, str(phase.until), not reason, reason, ratio
-    return Transition(*what, impulse, contact, speed, math.nan)
+    """The transition at the end of a phase, with unknown savings."""
+    contact, impulse = impact.least_impulse
+    until, nan = str(phase.until), math.nan
+    return Transition(phase.number, until, not reason, reason, ratio, impulse, contact, speed, nan)

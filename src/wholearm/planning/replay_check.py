@@ -1,4 +1,4 @@
-"""Verification of a plan by simulation of its torques, and other plans where it fails.
+"""Verification of a plan by simulation of its torques, and replanning where it fails.
 
 The residual of the equations of motion is independent of the planner (`verification.newton_euler`).
 """
@@ -22,15 +22,15 @@ from ..results.torque import ERROR, TorqueProfile, format_rows, place_rows, samp
 from ..results.trajectory import Samples, Trajectory, sample_phases
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
-from ..verification.verify import Allowance, describe_motors, find_commands, judge, observe
+from ..verification.verify import Allowance, describe_motors, find_commands, judge, replay_torques
 from .blocks import BlockPlan, Planning, plan_each
 from .phase_plan import combine
 
-SPARE = 2.0  # additional normal force over a small shortfall
-_LATE = 1e-2  # largest error of an arrival, over the duration of its phase, that is no departure
+INCREASE = 2.0  # increase of epsilon over a small shortfall of c_n
+_ARRIVAL_ERROR = 1e-2  # largest error of an arrival over the duration of its phase
 RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
-_FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
-_ATTEMPTS = 3  # most tables that are tried
+_DIVISOR = 8.0  # of the error of the rows of a table if its replay does not hold
+_ATTEMPTS = 3  # most tables
 
 
 class Residual(NamedTuple):
@@ -60,29 +60,29 @@ class ReplayCheck(NamedTuple):
         return self.report.failed_phase, self.report.reason
 
     def find_culprit(self, scales: Scales, allowance: Allowance, trajectory: Trajectory) -> int:
-        """Number of the phase to plan otherwise: the first that departs, moves on, or fails.
+        """Number of the phase to replan: the first that departs from the plan, or that fails.
 
-        Speed left at a stop times the duration of the next phase counts as a departure, too. So
-        does the time of an arrival: a slow motion may come to its end too early by a tenth. Case:
-        phase 2 of a triangle's flip for the largest margin.
+        A departure is a deviation in position, a speed at a stop, also times the duration of the
+        next phase, or an error of the arrival time. Case of the last: phase 2 of a triangle's flip
+        for the largest margin, a slow motion that arrives too early by a tenth.
         """
         assert self.failure is not None
         starts = trajectory.phase_starts
         durations = np.diff(starts)
         following = dict(enumerate(durations[1:].tolist(), start=1))
         # A dwell comes after the arrival.
-        lasts = [m.end if isinstance(m, HeldMotion) else m.duration for m in trajectory.motions]
-        ends = starts[:-1] + lasts
+        times = [m.end if isinstance(m, HeldMotion) else m.duration for m in trajectory.motions]
+        ends = starts[:-1] + times
         for phase in self.report.phases if isinstance(self.report, Report) else ():
             k = phase.number - 1
             arrival = ends[k] if phase.arrival is None else phase.arrival
-            off = phase.deviation.measure(scales.length) if phase.deviation else 0.0
-            departs = off > allowance.departure
+            deviation = phase.deviation.measure(scales.length) if phase.deviation else 0.0
+            departs = deviation > allowance.departure
             speed = phase.end_speed or 0.0
-            carried = speed * following.get(phase.number, 0.0)
-            fast = speed > allowance.rest_speed * scales.speed
-            late = abs(arrival - ends[k]) > _LATE * durations[k]
-            if departs or fast or late or carried > allowance.departure * scales.length:
+            displacement = speed * following.get(phase.number, 0.0)
+            moving = speed > allowance.rest_speed * scales.speed
+            late = abs(arrival - ends[k]) > _ARRIVAL_ERROR * durations[k]
+            if departs or moving or late or displacement > allowance.departure * scales.length:
                 return min(phase.number, self.failure[0])
         return self.failure[0]
 
@@ -90,7 +90,7 @@ class ReplayCheck(NamedTuple):
 def replay_plan(
     planning: Planning, report: Callable[[str], None]
 ) -> tuple[Planning, ReplayFigures]:
-    """Replay a plan, and other plans of blocks until one holds; ReplayError if none does."""
+    """Replay a plan, replanning blocks until the replay holds; ReplayError if none does."""
     problem, allowance, simulations = planning.problem, Allowance(), 0
     while True:
         simulations += 1
@@ -99,11 +99,11 @@ def replay_plan(
         if check.failure is None:
             break
         number = check.find_culprit(problem.scene.scales, allowance, planning.trajectory)
-        # The speed left where phase 8 of query 72 ends is not why phase 12 fails under rate limits.
+        # Under rate limits the final speed of phase 8 of query 72 does not cause phase 12 to fail.
         suspects = dict.fromkeys((number, check.failure[0]))
-        plans = (_improve(planning, phase, check, report) for phase in suspects)
-        better = next((plan for plan in plans if plan is not None), None)
-        if better is None:
+        plans = (_replan(planning, phase, check, report) for phase in suspects)
+        replanned = next((plan for plan in plans if plan is not None), None)
+        if replanned is None:
             failed, reason = check.failure
             first = "" if number == failed else f", which departs in phase {number} first"
             ends = f"planned to end at t = {planning.trajectory.phase_starts[failed]:.5g} s"
@@ -112,84 +112,84 @@ def replay_plan(
                 f"{ends}; other intervals, another objective or time weight may do, and "
                 "--no-replay (replay=False) leaves the check out"
             )
-        planning = better
+        planning = replanned
     assert isinstance(check.report, Report)
     phases = list[ReplayedPhase]()
     for phase in check.report.phases:
         deviations = phase.end_deviation, phase.deviation
-        end, most = (each and RecordedDeviation(*each) for each in deviations)
-        phases.append(ReplayedPhase(phase.arrival, phase.end_speed, end, most, phase.least_force))
-    least, sizes = check.report.least_force, (check.residual.size, check.report.steps, simulations)
+        end, peak = (each and RecordedDeviation(*each) for each in deviations)
+        phases.append(ReplayedPhase(phase.arrival, phase.end_speed, end, peak, phase.least_force))
+    least, residual, steps = check.report.least_force, check.residual.size, check.report.steps
     assert least is not None
-    return planning, ReplayFigures(least, tuple(phases), *sizes)
+    return planning, ReplayFigures(least, tuple(phases), residual, steps, simulations)
 
 
-def _improve(
+def _replan(
     planning: Planning, number: int, check: ReplayCheck, report: Callable[[str], None]
 ) -> Planning | None:
-    """The first other plan of the block with phase `number` that there is, None without one.
+    """Another plan of the block with phase `number`; None without one.
 
-    For the largest margin in less time, as slow motions are less stable in open loop: query 37 of
-    `bench queries`. Then with a larger epsilon, as at a reversal a replay may stick for an instant,
-    with another force: least effort of leg 22 of seed 7.
+    For the largest margin first in less time, as slow motions are less stable in open loop: query
+    37 of `bench queries`. Then with a larger epsilon, as a replay may stick for an instant at a
+    reversal, with another force: least effort of leg 22 of seed 7.
     """
-    others, pairs = list[Planning](), enumerate(planning.blocks)
+    candidates, pairs = list[Planning](), enumerate(planning.blocks)
     index, block = next(pair for pair in pairs if number <= pair[1].phases[-1].number)
-    # Torques where blocks meet depend on both where they may not step.
+    # Continuous torques between blocks depend on both.
     reach = 1 if planning.problem.scene.has_slow_motors else 0
-    near = range(index - reach, index + reach + 1)
-    blocks = enumerate(planning.blocks)
-    coarse = tuple(replace(each, coarse=each.coarse or k in near) for k, each in blocks)
-    again = replace(planning, blocks=coarse)
-    if planning.allowed:
-        least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
-        allowed = [
-            (duration + least[k]) / 2 if k in least else duration
-            for k, duration in enumerate(planning.allowed)
+    span = range(index - reach, index + reach + 1)
+    coarse = tuple(replace(b, coarse=b.coarse or k in span) for k, b in enumerate(planning.blocks))
+    marked = replace(planning, blocks=coarse)
+    if planning.durations:
+        times = {p.index: planning.fastest[p.index].motion.duration for p in block.phases}
+        durations = [
+            (duration + times[k]) / 2 if k in times else duration
+            for k, duration in enumerate(planning.durations)
         ]
-        if sum(allowed[k] for k in least) > 1.1 * sum(least.values()):
-            others.append(replace(again, allowed=allowed))
-    short = _find_dip(planning, block, check) if index not in planning.more else 0.0
-    if short:
-        others.append(replace(again, more=planning.more | {index: SPARE * short}))
-    for other in others:
+        if sum(durations[k] for k in times) > 1.1 * sum(times.values()):
+            candidates.append(replace(marked, durations=durations))
+    extra = planning.extra_epsilon
+    shortfall = _find_shortfall(planning, block, check) if index not in extra else 0.0
+    if shortfall:
+        candidates.append(replace(marked, extra_epsilon=extra | {index: INCREASE * shortfall}))
+    for candidate in candidates:
         try:
-            made = plan_each(other, report)
+            planned = plan_each(candidate, report)
         except (InfeasibleError, SolverError):
             continue
-        return made if other.more is planning.more else _add_loss(planning, made, index)
+        return planned if candidate.extra_epsilon is extra else _add_cost(planning, planned, index)
     return None
 
 
-def _add_loss(planning: Planning, made: Planning, index: int) -> Planning:
-    """The plans that are made with a larger epsilon of a block, whose errors have its cost, too."""
+def _add_cost(planning: Planning, replanned: Planning, index: int) -> Planning:
+    """The plans with a larger epsilon of a block, whose error includes the cost of that."""
     before, after = (
         combine(each.options.goal, [plan.value for plan in each.blocks[index].plans])
-        for each in (planning, made)
+        for each in (planning, replanned)
     )
-    blocks, loss = list(made.blocks), abs(after - before) / max(abs(after), 1e-300)
-    plans = [plan._replace(error=plan.error + loss) for plan in blocks[index].plans]
+    blocks, cost = list(replanned.blocks), abs(after - before) / max(abs(after), 1e-300)
+    plans = [plan._replace(error=plan.error + cost) for plan in blocks[index].plans]
     blocks[index] = replace(blocks[index], plans=plans)
-    return replace(made, blocks=tuple(blocks))
+    return replace(replanned, blocks=tuple(blocks))
 
 
-def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float:
-    """By how much c_n of a block falls short of epsilon in its replay, if only a little [N]."""
+def _find_shortfall(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float:
+    """Shortfall of c_n below epsilon in the replay of a block [N]; 0 if it is not small."""
     numbers = [phase.number for phase in block.phases]
     phases = check.report.phases if isinstance(check.report, Report) else ()
     contacts = [
         contact for phase in phases if phase.number in numbers for contact in phase.contacts
     ]
-    short = -min((contact.margin for contact in contacts), default=0.0)
+    shortfall = -min((contact.margin for contact in contacts), default=0.0)
     # Phase 11 of query 72, over time: 2.1e-3, for microseconds where a contact changes its name.
-    return short if 0.0 < short < 4e-3 * planning.problem.scene.scales.force else 0.0
+    return shortfall if 0.0 < shortfall < 4e-3 * planning.problem.scene.scales.force else 0.0
 
 
 def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> ReplayCheck:
     """Replay of a plan, and residual of the equations of motion."""
     residual = find_residual(problem, trajectory)
     try:
-        replay = observe(problem, trajectory.torque, trajectory)
+        replay = replay_torques(problem, trajectory.torque, trajectory)
     except (JammingError, SimulationError) as error:
         return ReplayCheck(error, residual)
     return ReplayCheck(judge(replay, trajectory, allowance), residual)
@@ -199,34 +199,34 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     """Largest residual of the equations of motion at the samples of a trajectory."""
     if len(trajectory.t) < 100 * len(trajectory.motions):
         trajectory = assemble(trajectory.motions, trajectory.torque, {}, 201)  # rows per phase
-    worst = Residual(0.0, 1, "")
-    # Forces are not determined in a dwell.
+    largest = Residual(0.0, 1, "")
+    # Forces in a dwell are indeterminate.
     moving = ~trajectory.held
     t, phases, *samples = (
         getattr(trajectory, name)[moving] for name in ("t", "phase", *Samples._fields)
     )
-    torques = trajectory.contacts, trajectory.torque
-    motions = sample_phases(t, phases, Samples(*samples), *torques)
+    names, torque = trajectory.contacts, trajectory.torque
+    motions = sample_phases(t, phases, Samples(*samples), names, torque)
     for phase, motion in zip(problem.phases, motions, strict=True):
         formation = phase.formation
         contacts = {contact.name: contact for contact in formation.contacts}
         motion_contacts = [contacts[name] for name in motion.contacts]
-        left = balance(problem.scene, motion_contacts, formation.rolling, motion.samples)
-        size, row, text = left.find_worst()
-        if not size <= worst.size:
-            when = f"at t = {motion.t[row]:.5g} s, phase {phase.number}"
-            worst = Residual(size, phase.number, f"{text} {when}")
-    return worst
+        residual = balance(problem.scene, motion_contacts, formation.rolling, motion.samples)
+        size, row, text = residual.find_worst()
+        if not size <= largest.size:
+            place = f"at t = {motion.t[row]:.5g} s, phase {phase.number}"
+            largest = Residual(size, phase.number, f"{text} {place}")
+    return largest
 
 
 class TorqueTable(NamedTuple):
-    """Rows of torques, and what their replay does."""
+    """Rows of torques, and the results of their replay."""
 
     rows: Array  # (n, 3) [s, N m, N m]: t, tau_1 and tau_2; a time given twice is a step
     # plain values: rows, rate, interpolation, and of the replay whether it holds, why, and arrival
     # and least normal force of each phase and of the plan's
     figures: dict[str, Any]
-    commands: Array | None = None  # (n, 2) [N m]: what motors that lag are told at these times
+    commands: Array | None = None  # (n, 2) [N m]: commands of lagging motors at these times
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the rows as CSV."""
@@ -240,7 +240,7 @@ def make_table(
     rate: float | None = None,
     interpolation: str = "linear",
 ) -> TorqueTable:
-    """A plan's torques in rows as dense as a simulation of them needs to hold, and their replay.
+    """A plan's torques in rows as dense as their replay needs, and the results of that.
 
     Samples at a `rate` [Hz] are replayed as they are; their failure is no error.
 
@@ -251,41 +251,41 @@ def make_table(
     """
     sampling: dict[str, Any] = {}
     if rate is None:
-        rows, compared = _find_rows(problem, trajectory, replay)
+        rows, comparison = _find_rows(problem, trajectory, replay)
     else:
         sampling = {"sample_rate": rate, "interpolation": interpolation}
-        rows, compared = sample_rows(trajectory.torque, rate, interpolation), None
+        rows, comparison = sample_rows(trajectory.torque, rate, interpolation), None
         if replay:
             try:
-                simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
-                compared = _compare(trajectory, judge(simulation, None, Allowance()))
+                simulation = replay_torques(problem, TorqueProfile.join_rows(rows), trajectory)
+                comparison = _compare(trajectory, judge(simulation, None, Allowance()))
             except (JammingError, SimulationError) as error:
-                compared = {"ok": False, "reason": str(error), "phases": []}
+                comparison = {"ok": False, "reason": str(error), "phases": []}
     lag = problem.scene.actuator_lag
     commands = find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
-    return TorqueTable(rows, {"rows": len(rows), **sampling, "replay": compared}, commands)
+    return TorqueTable(rows, {"rows": len(rows), **sampling, "replay": comparison}, commands)
 
 
 def _find_rows(
     problem: Problem, trajectory: Trajectory, replay: bool
 ) -> tuple[Array, dict[str, Any] | None]:
-    """Rows that a simulation of them holds with, and its figures; None without a `replay`."""
+    """Rows whose replay holds, and its figures, which are None without a `replay`."""
     rate_limit = problem.scene.torque_rate_limit if problem.scene.has_slow_motors else None
-    least, error = ERROR / _FINER ** (_ATTEMPTS - 1), ERROR
+    least_error, error = ERROR / _DIVISOR ** (_ATTEMPTS - 1), ERROR
     rows = place_rows(trajectory.torque, error, rate_limit)
-    # Commands step where the slopes of lines do, so that motors' limits need no replay.
-    while error > least and describe_motors(problem, TorqueProfile.join_rows(rows)):
+    # Limits of motors need no replay: commands step where the slopes of lines do.
+    while error > least_error and describe_motors(problem, TorqueProfile.join_rows(rows)):
         error /= 2
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
         return rows, None
     for _ in range(_ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
-        simulation = observe(problem, TorqueProfile.join_rows(rows), trajectory)
+        simulation = replay_torques(problem, TorqueProfile.join_rows(rows), trajectory)
         report = judge(simulation, trajectory, Allowance())
-        if report.ok or error <= least:
+        if report.ok or error <= least_error:
             break
-        error = max(error / _FINER, least)
+        error = max(error / _DIVISOR, least_error)
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not report.ok:
         report = judge(simulation, None, Allowance())
@@ -298,7 +298,7 @@ def _find_rows(
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
-    """Arrival and least normal force of each phase of a replay, beside those of the plan."""
+    """Arrival and least normal force of each phase of a replay, with those of the plan."""
     phases = []
     for index in range(len(trajectory.motions)):
         phase = report.phases[index] if index < len(report.phases) else None

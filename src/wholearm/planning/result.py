@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, get_type_hints
 
 from numpy.typing import ArrayLike
 
-from ..common.document import Document, Drawn, Result, Table, fixed, plain, restore
+from ..common.document import Document, Drawn, Result, Table, fixed, restore, to_plain
 from ..common.errors import InputError, name_source
 from ..problem.definition import PARAMETERS, Problem
-from ..problem.read import read_own_problem
+from ..problem.read import read_stored_problem
 from ..results.dwell_record import Settling
 from ..results.planned_motion import PlannedMotion
 from ..results.report import Certificate, RangeFigures, ReplayFigures, Transition, UniquenessMargin
@@ -32,9 +32,9 @@ _KEYS = {
     "error": "phase_errors", "uniqueness_margin": "uniqueness_margins",
     "build_time": "build_times", "solve_time": "solve_times",
 }  # fmt: skip
-"""What `meta` calls fields of phases and of their statistics; others have the same name there."""
+"""Keys in `meta` of fields of phases and of their statistics; other fields keep their name."""
 _OPTIONS = [o.name for o in fields(PlanOptions) if o.name not in ("objective", "replay", "ranges")]
-"""Options that stand in `meta` by themselves."""
+"""Options with a key of their own in `meta`."""
 _PARTS = ("versions", "transitions", "replay", "certificate", "timings", "ranges")
 """Fields of a plan that have the same name in `meta`."""
 
@@ -45,8 +45,8 @@ class Status(Enum):
     SOLVED = "solved"
     BEST = "solved, best of several sequences of contact modes"
     STOPPED = "stopped early, with the best so far"
-    """The search for contact modes has tried as many sequences as it may, with more to try, or no
-    larger margin was found than that of a plan of least time."""
+    """The mode search has reached its number of sequences before it was complete, or no larger
+    margin was found than that of a plan of least time."""
 
     @staticmethod
     def of(phases: tuple[PlannedPhase, ...]) -> Status:
@@ -57,20 +57,20 @@ class Status(Enum):
 
 
 class PlannedPhase(NamedTuple):
-    """One phase of a plan; files of earlier versions may not have what has a default."""
+    """One phase of a plan; files of earlier versions may lack fields with a default."""
 
     number: int  # from 1
     statistics: SolverStatistics  # of all solves for this phase, or for a block from this one on
-    value: float = 0.0  # its share of the objective: s, (N m)^2 s or N
+    value: float = 0.0  # its part of the objective: s, (N m)^2 s or N
     duration: float = 0.0  # [s]
     rolling: tuple[str, ...] = ()  # contacts that the problem lets roll
     modes: tuple[ModeSpan, ...] = ()  # contact modes in the time domain; none along a curve
-    sequences: int = 0  # of modes that were tried; of phases in one NLP booked to the first
-    complete: bool = True  # whether every sequence of modes that promised to be better was tried
-    attempt: str = ""  # the guess that it was found from, in the time domain
+    sequences: int = 0  # of modes that were solved; of phases in one NLP booked to the first
+    complete: bool = True  # whether all neighbouring sequences of modes were solved
+    attempt: str = ""  # name of its initial guess, in the time domain
     error: float = math.nan  # estimated relative error of the value, of all phases in its NLP
     uniqueness_margin: UniquenessMargin | None = None  # of its contact forces
-    # [s]: for how long friction could hold everything at rest; None if it does not begin so
+    # [s]: time for which friction may hold everything at rest; None if it starts in motion
     wedged: float | None = None
     settling: Settling | None = None  # dwell at its end, included in `duration`
     unheld: float | None = None  # `value` with free torques, if they are held over periods
@@ -81,12 +81,12 @@ _STATISTICS = [statistic.name for statistic in fields(SolverStatistics)]
 
 
 class Timings(NamedTuple):
-    """Seconds that planning took."""
+    """Times of planning [s]."""
 
-    # trace, plan, replay, assess: tracing curves; all up to the first plan; its replay, and other
-    # plans of blocks that failed in it (in `plan` where a search has replayed); gains of impacts
+    # trace, plan, replay, assess: tracing curves; all up to the first plan; its replay and the
+    # replanning of blocks (in `plan` if a search has replayed it); savings by impacts
     trace: float = 0.0
-    build: float = 0.0  # build, solve: building NLPs and solving them, in all of these
+    build: float = 0.0  # build, solve: building and solving NLPs, within these
     solve: float = 0.0
     plan: float = 0.0
     replay: float = 0.0
@@ -95,21 +95,21 @@ class Timings(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Drawn, Result):
-    """A planned motion with what it was asked and what is known about it."""
+    """A planned motion with its problem, options, statistics and verification."""
 
     problem: Problem
     options: PlanOptions
     status: Status
     value: float  # of the objective, in `unit`
-    # the motion. Its `meta` says the same as the plan in plain values, for files.
+    # the motion; its `meta` has the plan in plain values, for files
     trajectory: Trajectory = field(repr=False)
     phases: tuple[PlannedPhase, ...]
     transitions: tuple[Transition, ...] = ()  # impacts that the problem asks for
     replay: ReplayFigures | None = None  # none if the plan was not replayed
     timings: Timings = field(default_factory=Timings)
-    versions: Mapping[str, str] = field(default_factory=dict)  # of packages that it plans with
-    certificate: Certificate | None = None  # lower bounds of the durations, if they were asked for
-    ranges: RangeFigures | None = None  # what ranges cost, for a robust plan
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the packages used
+    certificate: Certificate | None = None  # lower bounds of the durations, with `certify`
+    ranges: RangeFigures | None = None  # cost of the ranges, for a robust plan
 
     @property
     def headline(self) -> str:
@@ -124,9 +124,9 @@ class Plan(Drawn, Result):
 
     @property
     def error(self) -> float:
-        """Estimate of how far the value is from the best, relative to it; NaN where it is unknown.
+        """Estimated relative distance of the value from a local optimum; NaN if unknown.
 
-        It says what finer grids would gain for these contact modes, not what other modes would.
+        It is the gain of finer grids in these contact modes, not that of other modes.
         """
         if self.options.goal is Objective.MARGIN:
             return min(self.phases, key=lambda phase: phase.value).error
@@ -136,12 +136,12 @@ class Plan(Drawn, Result):
 
     @property
     def duration(self) -> float:
-        """How long the motion lasts [s]."""
+        """Duration of the motion [s]."""
         return self.trajectory.duration
 
     @property
     def statistics(self) -> SolverStatistics:
-        """What solving has cost in all."""
+        """Total cost of solving."""
         return reduce(add, (phase.statistics for phase in self.phases))
 
     @property
@@ -156,7 +156,7 @@ class Plan(Drawn, Result):
 
     @property
     def document(self) -> Document:
-        """Phases, what the replay has shown and what is known of the value."""
+        """Report of phases, replay, value and its error."""
         return describe_plan(self)
 
     def at(self, t: ArrayLike) -> Samples:
@@ -173,11 +173,11 @@ class Plan(Drawn, Result):
 
 
 def write_meta(plan: Plan) -> dict[str, Any]:
-    """All of a plan but its motion, in plain values."""
+    """The plan but its motion in plain values."""
     phases, options = plan.phases, plan.options
     of_phases = {name: [getattr(phase, name) for phase in phases] for name in _PHASES}
-    spent = {name: [getattr(each.statistics, name) for each in phases] for name in _STATISTICS}
-    values: dict[str, Any] = plain(
+    costs = {name: [getattr(each.statistics, name) for each in phases] for name in _STATISTICS}
+    values: dict[str, Any] = to_plain(
         {
             "status": plan.status,
             "name": plan.problem.name,
@@ -186,7 +186,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "value_unit": plan.unit,
             "error": plan.error,
             "epsilon": plan.problem.epsilon,
-            **{_KEYS.get(name, name): each for name, each in (of_phases | spent).items()},
+            **{_KEYS.get(name, name): each for name, each in (of_phases | costs).items()},
             **{name: getattr(options, name) for name in _OPTIONS},
             **{name: getattr(plan, name) for name in _PARTS},
         }
@@ -195,7 +195,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read the plan of a trajectory file, with defaults for values that older files do not have.
+    """Read the plan of a trajectory file; values that older files lack have defaults.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     trajectory = load_trajectory(path)
     source = str(path)
-    problem = read_own_problem(trajectory.meta, source)
+    problem = read_stored_problem(trajectory.meta, source)
     try:
         with name_source(source, "meta."):
             return _read(trajectory, problem)
@@ -251,11 +251,11 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
     value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"
     if not math.isnan(plan.error):
         # Compared as printed, with one digit.
-        error = f"{max(plan.error, 1e-9):.0e}"  # limits are kept to about that
-        missed = float(error) > plan.options.accuracy
-        text = f"; accuracy {plan.options.accuracy:g} not reached" if missed else ""
+        error = f"{max(plan.error, 1e-9):.0e}"  # limits hold to about 1e-9
+        exceeded = float(error) > plan.options.accuracy
+        text = f"; accuracy {plan.options.accuracy:g} not reached" if exceeded else ""
         value += f" (to {error}{text})"
-    wrote = f"; wrote {output}" if output else ""
+    suffix = f"; wrote {output}" if output else ""
     transitions = {
         "phase": "after phase:d", "velocity_ratio": "velocity ratio:.6f",
         "least_impulse": "least impulse [N s per m/s]:.6f", "least_impulse_contact": "of",
@@ -272,7 +272,7 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
         *_describe_ranges(plan),
         *(() if table is None else _list_table(table)),
         _describe_uniqueness(plan),
-        f"{value}, {plan.duration:.6f} s in all{wrote}",
+        f"{value}, {plan.duration:.6f} s in all{suffix}",
     ]
     return Document("", parts=parts)
 
@@ -318,10 +318,10 @@ def _list_settlings(plan: Plan) -> Iterator[str | Table]:
     yield Table(heads, rows)
     yield from (f"warning: {dwell.warning}" for dwell in dwells if dwell.warning)
     held, share = (sum(getattr(dwell, key) for dwell in dwells) for key in ("duration", "share"))
-    text, whole = f"held for {held:.6g} s in all", held / share if share else plan.duration - held
-    more = plan.duration - held - whole
-    changes = f"; torques change into and out of that for {more:.6g} s more"
-    yield f"{text}, {share:.1%} of the motion's {whole:.6f} s{changes * (more > 1e-9 * whole)}"
+    text, time = f"held for {held:.6g} s in all", held / share if share else plan.duration - held
+    extra = plan.duration - held - time
+    changes = f"; torque changes before and after dwells take {extra:.6g} s more"
+    yield f"{text}, {share:.1%} of the motion's {time:.6f} s{changes * (extra > 1e-9 * time)}"
 
 
 def _describe_held(plan: Plan) -> Iterator[str]:
@@ -331,8 +331,8 @@ def _describe_held(plan: Plan) -> Iterator[str]:
     if len(free) == len(plan.phases):
         value = combine(plan.options.goal, free)
         text = f"torques {scene.control_hold} over {1e3 * scene.control_period:g} ms each:"
-        more = f"{plan.value / value - 1:+.2%} of the {plan.options.goal.value}"
-        yield f"{text} {more} with free ones, {value:.6f} {plan.unit}"
+        cost = f"{plan.value / value - 1:+.2%} of the {plan.options.goal.value}"
+        yield f"{text} {cost} with free ones, {value:.6f} {plan.unit}"
 
 
 def _describe_replay(plan: Plan) -> str:
@@ -343,10 +343,10 @@ def _describe_replay(plan: Plan) -> str:
     ends = [phase.end_deviation for phase in replay.phases if phase.end_deviation]
     least = replay.least_c_n
     short = epsilon - least.value
-    below = f", {short:.1e} N below epsilon between samples" if short > 1e-6 * least.value else ""
+    note = f", {short:.1e} N below epsilon between samples" if short > 1e-6 * least.value else ""
     return (
         f"replayed: least c_n {least.value:{fixed(epsilon or 0.05, 5)}} N on "
-        f"{least.contact}{below}, off by at most "
+        f"{least.contact}{note}, off by at most "
         f"{max((end.m for end in ends), default=0.0):.1e} m and "
         f"{max((end.rad for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
@@ -379,8 +379,8 @@ def _describe_ranges(plan: Plan) -> Iterator[str]:
         if radius and units[name] != "s"
     ]
     yield f"within ranges of {', '.join(radii)}"
-    more = f"{100 * (plan.value / ranges.nominal - 1):+.1f} % of the {plan.options.goal.value}"
-    yield f"{more} without ranges, {ranges.nominal:.6f} {plan.unit}"
+    cost = f"{100 * (plan.value / ranges.nominal - 1):+.1f} % of the {plan.options.goal.value}"
+    yield f"{cost} without ranges, {ranges.nominal:.6f} {plan.unit}"
     if ranges.held:
         numbers = " and ".join(map(str, ranges.held))
         yield f"friction within the ranges may hold the start of phase {numbers}"
@@ -408,7 +408,7 @@ def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
 
 
 def _describe_uniqueness(plan: Plan) -> str:
-    """Uniqueness margin of contact forces, and for how long phases are possibly stuck."""
+    """Uniqueness margin of contact forces, and times for which phases may be stuck."""
     margins = [(p.uniqueness_margin, p.number) for p in plan.phases if p.uniqueness_margin]
     if not margins:
         return ""

@@ -1,4 +1,4 @@
-"""Torques as a function of the joints: policies made from plans, and their step in a control loop.
+"""Feedback policies: joint torques from joint angles and speeds, made from plans.
 
 Making a policy uses the model of the hand; its step uses nothing but the tables in its file.
 """

@@ -15,7 +15,7 @@ from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source, require_number, require_vector
 from ..common.files import read_arrays, require_ending, write_whole
-from .curve_law import CurveLaw, Law, LoopSettings, MotionLaw, Sensing
+from .curve_law import CurveLaw, ForceFilter, Law, LoopSettings, TimeLaw
 
 FORMAT = 1  # Version of the files
 KINDS: Mapping[str, Mapping[str, tuple[int | str, ...]]] = {
@@ -33,11 +33,11 @@ KINDS: Mapping[str, Mapping[str, tuple[int | str, ...]]] = {
 
 
 class Policy(Result):
-    """Torques as a function of what a hand can measure.
+    """Joint torques as a function of joint angles, speeds and, where measured, normal forces.
 
     Parameters
     ----------
-    tables  arrays of each law; see `CurveLaw` and `MotionLaw`
+    tables  arrays of each law; see `CurveLaw` and `TimeLaw`
     about   name of the problem, duration, phases
     laws    number of laws that are carried out, by default all; the next one holds the end
     sensor  whether simulations provide normal forces
@@ -48,9 +48,9 @@ class Policy(Result):
 
     Notes
     -----
-    Call `step` once per period, right after measuring; its torques are to be applied `delay` later,
-    until the next ones are. It takes some 20 us, allocates little, and uses neither CasADi nor
-    arrays. One policy carries out one motion at a time::
+    Call `step` once per period, right after measuring. Apply its torques `delay` later, for one
+    period. It takes some 20 us, allocates little, and uses neither CasADi nor arrays. One policy
+    carries out one motion at a time::
 
         policy = Policy.load("policy.npz")
         policy.reset()
@@ -58,7 +58,7 @@ class Policy(Result):
             set_torques(*policy.step(read_angles(), read_speeds()))
             wait_for_next_period()
 
-    It switches phases by the motion of the joints, and in the end holds the last torques.
+    It switches phases by the motion of the joints. At the end it holds the last torques.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Policy(Result):
         self.tables, self.settings, self.about = tuple(tables), settings, dict(about or {})
         self.laws = list[Law]()
         for arrays in reversed(self.tables):
-            kind = CurveLaw if "s" in arrays else MotionLaw
+            kind = CurveLaw if "s" in arrays else TimeLaw
             self.laws.insert(0, kind(arrays, settings, self.laws[0] if self.laws else None))
         self.sensor = sensor
         self.last = len(self.laws) - 1 if laws is None else laws - 1
@@ -84,10 +84,10 @@ class Policy(Result):
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
             entries = phases[first - 1 : first - 1 + len(law.starts)]
             names = [list(entry.get("reserves", {})) for entry in entries]
-            known = {len(each) for each in names}
-            if isinstance(law, CurveLaw) and known == {arrays["forces"].shape[2]}:
-                late, gained = self.settings.delay / self.settings.period, entries[-1]["gained"]
-                law.sensing = Sensing(names, gained, arrays["forces"], late)
+            sizes = {len(contact_names) for contact_names in names}
+            if isinstance(law, CurveLaw) and sizes == {arrays["forces"].shape[2]}:
+                delay, gained = self.settings.delay / self.settings.period, entries[-1]["gained"]
+                law.filter = ForceFilter(names, gained, arrays["forces"], delay)
                 contacts.update(dict.fromkeys(chain(*names, [gained] if gained else [])))
         self.contacts = list(contacts)
         self.reset()
@@ -102,10 +102,10 @@ class Policy(Result):
         """Durations of phases, their robustness margins and ranges."""
         phases, rows, lines = self.about.get("phases", []), [], []
         for phase in phases:
-            # Of a phase of microseconds errors may take away next to nothing.
-            each = phase.get("reserves", {}).items()
+            # Errors of a phase of microseconds, and with them the margin, may be tiny.
+            reserves = phase.get("reserves", {}).items()
             kept = [
-                f"{level:.2f} {name}" if level > -10 else f"<-10 {name}" for name, level in each
+                f"{level:.2f} {name}" if level > -10 else f"<-10 {name}" for name, level in reserves
             ]
             share = phase["share"] if kept else ""
             rows.append([phase["number"], phase["plan"], phase["duration"], share, ", ".join(kept)])
@@ -124,7 +124,7 @@ class Policy(Result):
 
     @property
     def values(self) -> dict[str, Any]:
-        """Everything in `about` but the problem."""
+        """The entries of `about` without the problem."""
         return {key: value for key, value in self.about.items() if key != "problem"}
 
     @property
@@ -133,7 +133,7 @@ class Policy(Result):
         return sum(len(law.starts) for law in self.laws[: self.last + 1])
 
     def require_count(self, count: int, of: str) -> None:
-        """InputError if it has another number of phases than a problem or a plan, as `of` says."""
+        """InputError if its number of phases is not `count`, that of a problem or plan (`of`)."""
         if self.count != count:
             text = f"{self.count} given; the {of} has {count}"
             raise InputError("", "phases of the policy", text)
@@ -190,11 +190,11 @@ class Policy(Result):
         """
         for name, values in (("theta", theta), ("theta_dot", theta_dot)):
             if len(values) != 2 or not all(map(math.isfinite, values)):
-                given = ", ".join(f"{value:g}" for value in values)
-                raise InputError("", name, f"{given} given; two finite numbers are needed")
+                text = ", ".join(f"{value:g}" for value in values)
+                raise InputError("", name, f"{text} given; two finite numbers are needed")
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
-        if law.over and self.index < self.last:
+        if law.finished and self.index < self.last:
             self.index += 1
             law = self.laws[self.index]
             law.begin()
@@ -212,8 +212,8 @@ class Policy(Result):
 
     def cut(self, last: int) -> Policy:
         """The policy of the phases up to the `last`, with those that it passes into in motion."""
-        kept = sum(first <= last for first in self.firsts)
-        return Policy(self.tables, self.settings, self.about, kept, self.sensor)
+        count = sum(first <= last for first in self.firsts)
+        return Policy(self.tables, self.settings, self.about, count, self.sensor)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
@@ -258,11 +258,11 @@ def _read_meta(arrays: Mapping[str, Any]) -> dict[str, Any]:
     if not valid:
         raise InputError("", "meta", "is not that of a policy; `wholearm policy` writes them")
     with name_source(prefix="meta.pace."):
-        one, two = require_vector(pace.pop("limit"), "limit", 2).tolist()
+        limit1, limit2 = require_vector(pace.pop("limit"), "limit", 2).tolist()
         pace = {key: require_number(value, key, nonnegative=True) for key, value in pace.items()}
-        for key, value in (("limit", min(one, two)), ("period", pace["period"])):
+        for key, value in (("limit", min(limit1, limit2)), ("period", pace["period"])):
             require_number(value, key, positive=True)
-    return meta | {"pace": LoopSettings(**pace, limit=(one, two))}
+    return meta | {"pace": LoopSettings(**pace, limit=(limit1, limit2))}
 
 
 def _read_tables(
@@ -272,14 +272,14 @@ def _read_tables(
     tables, count = dict[str, Any](), len(np.atleast_1d(arrays.get(f"theta_{number}", 0.0)))
     sizes: dict[int | str, int] = {"n": count, "n - 1": count - 1}
     for name, shape in shapes.items():
-        key, needed = f"{name}_{number}", [sizes.get(n, n) for n in shape]
+        key, expected = f"{name}_{number}", [sizes.get(n, n) for n in shape]
         if key not in arrays:
             raise InputError("", key, "array is missing")
         array = tables[name] = arrays[key]
         fits = array.dtype.kind == "f" and array.ndim == len(shape)
-        if not fits or any(w not in (n, "any") for w, n in zip(needed, array.shape, strict=True)):
+        if not fits or any(w not in (n, "any") for w, n in zip(expected, array.shape, strict=True)):
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape "
-            raise InputError("", key, f"{text}({', '.join(map(str, needed))}) needed")
+            raise InputError("", key, f"{text}({', '.join(map(str, expected))}) needed")
         if not np.isfinite(array).all():
             raise InputError("", key, "holds numbers that are not finite")
     if count < 2:
@@ -317,29 +317,29 @@ class ClosedLoop:
         self.policy, self.gains, self.first = policy.with_(), gains, phase
         self.period = policy.settings.period
         self.delay = policy.settings.delay if delay is None else delay
-        self.began: dict[int, float] = {}
+        self.phase_starts: dict[int, float] = {}
         self.policy.reset(phase)
 
     @property
     def over(self) -> bool:
         """Whether the last phase is over."""
         last = self.policy.last
-        return self.policy.index == last and self.policy.laws[last].over
+        return self.policy.index == last and self.policy.laws[last].finished
 
     def find_limit(self, last: int) -> float:
-        """How long to simulate phases up to the `last` [s], the first one's contact open: twice."""
+        """Time limit of a simulation of the phases up to `last` [s]: twice their duration."""
         phases = self.policy.about["phases"][self.first - 1 : last]
         return 2 * (0.05 + sum(float(phase["duration"]) for phase in phases))
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> tuple[float, float]:
-        """Torques for a state; as `simulation.run.Law`."""
-        felt: dict[str, float] | None = None
+        """Torques for a state [N m]; method of `simulation.run.Law`."""
+        measured: dict[str, float] | None = None
         if self.policy.sensor and t > 0.0:
-            felt = {name: forces.get(name, 0.0) for name in self.policy.contacts}
-        one, two = self.policy.step(theta.tolist(), theta_dot.tolist(), felt)
+            measured = {name: forces.get(name, 0.0) for name in self.policy.contacts}
+        torque1, torque2 = self.policy.step(theta.tolist(), theta_dot.tolist(), measured)
         # A phase may be shorter than a period.
-        for number in range(self.first + len(self.began), self.policy.phase + 1):
-            self.began[number] = t
-        return one * self.gains[0], two * self.gains[1]
+        for number in range(self.first + len(self.phase_starts), self.policy.phase + 1):
+            self.phase_starts[number] = t
+        return torque1 * self.gains[0], torque2 * self.gains[1]

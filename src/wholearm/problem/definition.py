@@ -1,4 +1,4 @@
-"""A problem: a scene, a start, the phases that lead from there; numbers not known exactly."""
+"""Definition of a problem: scene, start, phases or goals, and ranges of uncertain parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from ..common.arguments import check_kinds
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source, read_share, require_number, require_vector
+from ..common.errors import InputError, name_source, read_fraction, require_number, require_vector
 from ..common.fields import (
     NONNEGATIVE,
     NUMBER,
@@ -24,8 +24,8 @@ from ..common.fields import (
     choice,
     declare,
     key,
-    leave,
     refer,
+    unread,
 )
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -35,14 +35,14 @@ ROWS = {"x": 0, "phi": 2}  # rows of z that may be given where a phase ends
 
 
 class End(Enum):
-    """How a phase passes into the next one."""
+    """Transition of a phase to the next one."""
 
     REST = "rest"
     """Everything stops."""
     SMOOTH = "smooth"
-    """Position and velocity are continuous: a contact is gained softly or released."""
+    """The velocity is continuous: a contact is gained without impact, or released."""
     IMPACT = "impact"
-    """A contact is gained at speed: the velocity jumps onto the next phase's contacts."""
+    """Plastic impact: a contact is gained, and the velocity jumps."""
 
 
 class ModeGuess(NamedTuple):
@@ -51,71 +51,71 @@ class ModeGuess(NamedTuple):
     t: float  # [s]: from the start of the phase
     x: float  # [m]
     phi: float  # [rad]
-    signs: tuple[float, ...]  # of sliding velocities, 0 if a contact rolls, and joint velocities
+    signs: tuple[float, ...]  # of sliding velocities (0: rolling) and of joint velocities
 
 
-INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
+INDEX = unread({"type": "integer", "minimum": 0})  # number of an edge
 _NAME = "([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12]))"
 CONTACT = {"type": "string", "pattern": f"^{_NAME}$"}  # JSON Schema of the name of a contact
 DWELL = FieldKind(
-    lambda value, key: (read_share if isinstance(value, str) else NONNEGATIVE.read)(value, key),
+    lambda value, key: (read_fraction if isinstance(value, str) else NONNEGATIVE.read)(value, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
 )
-"""A time, or a share of the motion's."""
+"""A time [s], or a percentage of the duration of the motion."""
 
 
-def _find_way(place: tuple[str, float], z: Array, length: float) -> Array:
-    """How far z, shape (5, ...), is from a coordinate's value, x over a `length` and phi in rad."""
-    name, value = place
+def _measure(pin: tuple[str, float], z: Array, length: float) -> Array:
+    """Distance of z, shape (5, ...), to a pinned coordinate: x over `length`, phi in rad."""
+    name, value = pin
     return np.asarray(np.abs(z[ROWS[name]] - value) / (length if name == "x" else 1.0))
 
 
 @dataclass(frozen=True)
 class Until:
-    """What ends a phase: a contact gained, a coordinate of the pose reached, or a release.
+    """End of a phase: a contact is gained, a coordinate of the pose is reached, or a release.
 
-    With neither contact nor coordinate the phase ends where the planner chooses, by releasing the
-    contacts that the next phase does not have.
+    With neither contact nor coordinate, the phase ends by a release of the contacts that the next
+    phase does not have, at a place that the planner chooses.
     """
 
     contact: Contact | None = None  # the contact that is gained
-    coordinate: str = ""  # {"", "x", "phi"}: the coordinate, when there is one
+    coordinate: str = ""  # {"", "x", "phi"}: the coordinate, if there is one
     value: float | None = None  # [m] or [rad]
     pins: tuple[tuple[str, float], ...] = ()  # other coordinates, and their values [m] or [rad]
 
     @property
     def coordinates(self) -> tuple[tuple[str, float], ...]:
-        """Coordinates that are given where the phase ends, and their values."""
+        """Coordinates fixed at the end of the phase, and their values [m] or [rad]."""
         return self.pins if self.value is None else ((self.coordinate, self.value), *self.pins)
 
     @property
     def poses(self) -> tuple[tuple[int, float], ...]:
-        """Rows of z that are given where the phase ends, and their values."""
+        """Rows of z fixed at the end of the phase, and their values [m] or [rad]."""
         return tuple((ROWS[name], value) for name, value in self.coordinates)
 
     @property
     def conditions(self) -> int:
-        """How many conditions hold where the phase ends."""
+        """Number of conditions at the end of the phase."""
         return len(self.coordinates) + (self.contact is not None)
 
     def measure_pins(self, z: Array, length: float) -> Array:
-        """How far z, shape (5, ...), is from the pins at most, x over a `length` and phi in rad."""
-        ways = [_find_way(pin, z, length) for pin in self.pins]
-        return np.asarray(np.max(ways, axis=0, initial=0.0))
+        """Largest distance of z, shape (5, ...), to the pins: x over `length`, phi in rad."""
+        distances = [_measure(pin, z, length) for pin in self.pins]
+        return np.asarray(np.max(distances, axis=0, initial=0.0))
 
     def lead(self, z: Array, length: float) -> Until:
-        """The same with the coordinate first that has the longest way from z, shape (5,).
+        """The condition with the coordinate first that is farthest from z, shape (5,).
 
-        That one ends the phase. Ways of x are over a `length`, those of phi in rad.
+        This coordinate ends the phase. Distances of x are over `length`, those of phi in rad.
         """
         if self.value is None or not self.pins:
             return self
-        (name, value), *pins = sorted(self.coordinates, key=lambda at: -_find_way(at, z, length))
+        (name, value), *pins = sorted(self.coordinates, key=lambda at: -_measure(at, z, length))
         return replace(self, coordinate=name, value=value, pins=tuple(pins))
 
     @property
     def is_release(self) -> bool:
-        """Whether the phase ends by a release, where the planner chooses."""
+        """Whether the phase ends by a release, at a place that the planner chooses."""
         return self.contact is None and self.value is None
 
     def __str__(self) -> str:
@@ -135,7 +135,7 @@ class Until:
         "contacts",
         "Contacts that touch throughout, such as v1-palm, v3-finger1, e2-tip1; with ' rolling' "
         "behind it one does not slide.",
-        leave(
+        unread(
             {
                 "type": "array",
                 "minItems": 1,
@@ -149,7 +149,7 @@ class Until:
         "What ends the phase: a contact that is gained, or a coordinate; with two freedoms also "
         "both, or both coordinates: the one with the longer way ends it. Left out with end = "
         "'smooth': where the planner lets a contact go.",
-        leave({"oneOf": [refer("contact"), refer("until")]}),
+        unread({"oneOf": [refer("contact"), refer("until")]}),
         default=None,
     ),
     key("end", "How the phase passes into the next one.", choice(*(end.value for end in End))),
@@ -164,15 +164,15 @@ class Until:
         "in order, each with time t since the start of the phase [s], x [m] and phi_deg at its "
         "end, and the signs of the sliding velocities of `contacts` (0 if one rolls) and of the "
         "joint velocities, such as '-+0 ++'.",
-        leave({"type": "array", "minItems": 1, "items": refer("mode")}),
+        unread({"type": "array", "minItems": 1, "items": refer("mode")}),
     ),
 )
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A stretch of the motion on one contact formation."""
+    """A part of the motion with one contact formation."""
 
     index: int  # from 0; messages and files count from 1
-    formation: Formation  # of its contacts
+    formation: Formation
     until: Until
     end: End = End.REST
     settle: float | None = None
@@ -180,7 +180,7 @@ class Phase:
 
     @property
     def number(self) -> int:
-        """The phase's number for people, from 1."""
+        """Number of the phase in messages and files, from 1."""
         return self.index + 1
 
     def __post_init__(self) -> None:
@@ -199,9 +199,9 @@ class Phase:
 )
 @dataclass(frozen=True)
 class Goal:
-    """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad].
+    """Pose at which the object shall come to rest: an edge on the palm, or an angle phi [rad].
 
-    Both where that edge lies on the palm at that angle.
+    Both are set if that edge lies on the palm at that angle.
     """
 
     flush: int | None = None
@@ -215,19 +215,19 @@ class Goal:
         return text if self.x is None else f"{text} at x = {self.x:g} m"
 
     def find_angle(self, scene: Scene, near: float) -> float:
-        """The angle that the object shall have [rad], of all turns the nearest to one."""
+        """Angle of the goal [rad]; of an edge, modulo 2 pi, the angle nearest to `near`."""
         if self.phi is not None:
             return self.phi
         assert self.flush is not None
         angle = scene.polygon.flush_angle(self.flush)
         return angle + 2 * math.pi * round((near - angle) / (2 * math.pi))
 
-    def with_edge(self, scene: Scene, most: float) -> Goal:
-        """The goal with the edge that lies on the palm at its angle to within `most` [rad]."""
+    def with_edge(self, scene: Scene, tol: float) -> Goal:
+        """The goal with the edge that lies on the palm at its angle to within `tol` [rad]."""
         if self.phi is None:
             return self
         for edge in range(scene.polygon.n_vertices):
-            if abs(math.remainder(self.phi - scene.polygon.flush_angle(edge), math.tau)) < most:
+            if abs(math.remainder(self.phi - scene.polygon.flush_angle(edge), math.tau)) < tol:
                 return replace(self, flush=edge)
         return self
 
@@ -245,10 +245,10 @@ class Goal:
 )
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A manipulation to plan; an `InputError` names the key in a file of what is not allowed.
+    """A manipulation to plan; an `InputError` names the key of a value that is not allowed.
 
-    Formations of the phases are those of `scene`, whichever they were made for, so that
-    `dataclasses.replace` makes another problem of one scene, without checking it; `with_` checks.
+    Formations of the phases are moved to `scene`, so that `dataclasses.replace` returns a
+    consistent problem. It does not check values; `with_` does.
     """
 
     name: str
@@ -257,12 +257,12 @@ class Problem:
     start: Array  # (5,): configuration z at the start, with the fingers closed; see `place_start`
     phases: tuple[Phase, ...]  # none for a map, or with goals; replays need one or more
     source: str = ""  # the file this was read from
-    # half widths of ranges by name, by default those of `PARAMETERS`; None if it does not say
+    # half widths of ranges by name, by default those of `PARAMETERS`; None if the file has none
     uncertainty: Mapping[str, float] | None = None
-    checked: bool = field(default=False, repr=False)  # if not, it is checked when it is made
+    checked: bool = field(default=False, repr=False)  # if false, the constructor checks values
     settle: float | str = 0.0
     settle_gap: float | None = None
-    goals: tuple[Goal, ...] = ()  # where the object shall come to lie, in place of phases
+    goals: tuple[Goal, ...] = ()  # poses to reach, in place of phases
 
     def __post_init__(self) -> None:
         with name_source(self.source):
@@ -285,7 +285,7 @@ class Problem:
 
     @cached_property
     def table(self) -> Mapping[str, Any]:
-        """The problem as the nested tables of a file, empty if none can say it: `write_table`."""
+        """The nested tables of a problem file; empty if no file can describe it (`write_table`)."""
         from .table import write_table
 
         return write_table(self)
@@ -305,7 +305,7 @@ class Problem:
         **named
             Keys of a problem file: those at the top, of the object, of the start, of both fingers
             or of one as in `torque_limit1`; `finger_inertia`; `friction` of all parts or of one as
-            in `friction_palm`. None leaves out what is optional.
+            in `friction_palm`. None removes an optional value.
 
         Raises
         ------
@@ -316,50 +316,50 @@ class Problem:
         from .read import build_problem, name_keys
         from .table import change_table
 
-        # Values that are not in the file: its name would mislead.
+        # The source is set afterwards: errors would name a file without the changed values.
         table = change_table(self.table, {**(changes or {}), **named}, name_keys())
         return replace(build_problem(table), source=self.source)
 
     @property
     def ranges(self) -> dict[str, float]:
-        """Half widths of all ranges, those of lengths that are left out by the scene's length."""
+        """Half widths of all ranges; defaults of lengths are relative to the scene's length."""
         return read_widths(self.uncertainty or {}, length=self.scene.scales.length)
 
     @property
     def settle_share(self) -> float:
-        """Time for held ends that is shared out, over the motion's; zero if none is."""
-        return read_share(self.settle, "settle") if isinstance(self.settle, str) else 0.0
+        """Total dwell time over the duration of the motion; zero if `settle` is no percentage."""
+        return read_fraction(self.settle, "settle") if isinstance(self.settle, str) else 0.0
 
     def settles(self, phase: Phase) -> float | None:
-        """For how long the end of a phase at rest is held [s]; None where that is shared out."""
+        """Dwell time at the end of a phase [s]; None if it is allocated by the planner."""
         if phase.settle is None:
             return None if isinstance(self.settle, str) else self.settle
         return phase.settle
 
     @property
     def gap(self) -> float:
-        """By how much a contact may be open that closes at such an end [m]."""
+        """Largest gap from which a contact closes during a dwell [m]."""
         default = 3e-3 * self.scene.scales.length  # 0.1 mm of 35 mm
         return default if self.settle_gap is None else self.settle_gap
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Every contact of the plan, in the order of first use."""
-        used = (contact for phase in self.phases for contact in phase.formation.contacts)
-        return tuple(dict.fromkeys(used))
+        """All contacts of the phases, in the order of first use."""
+        contacts = (contact for phase in self.phases for contact in phase.formation.contacts)
+        return tuple(dict.fromkeys(contacts))
 
 
 LENGTH = 1 / 30
-"""Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
-_SHARE = "Half width, relative."
-_RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
+"""Length scale without a scene [m]: about that of the scenes in `problems/`."""
+_RATIO = "Half width, relative."
+_RELATIVE = unread({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
 _LENGTH = "Half width [m]."
 _RANGES = (
-    ("", "mass inertia", _SHARE, _RELATIVE, 0.05),
-    ("friction", "friction_palm friction_finger1 friction_finger2", _SHARE, _RELATIVE, 0.1),
+    ("", "mass inertia", _RATIO, _RELATIVE, 0.05),
+    ("friction", "friction_palm friction_finger1 friction_finger2", _RATIO, _RELATIVE, 0.1),
     ("geometry", "length1 length2 base1_x base1_y base2_x base2_y", _LENGTH, NONNEGATIVE, 6e-3),
     ("", "start_x", _LENGTH, NONNEGATIVE, 6e-3),
-    ("gain", "gain1 gain2", _SHARE, _RELATIVE, 0.01),
+    ("gain", "gain1 gain2", _RATIO, _RELATIVE, 0.01),
     ("", "delay", "Half width [s].", NONNEGATIVE, 1e-3),
 )
 PARAMETERS = tuple(
@@ -367,37 +367,37 @@ PARAMETERS = tuple(
     for _, names, text, kind, width in _RANGES
     for name in names.split()
 )
-"""All that can be varied; defaults of lengths are over the scene's length. A delay is never
-negative: its range is [0, half width]."""
+"""Uncertain parameters; defaults of lengths are over the scene's length. The range of the delay is
+[0, half width]."""
 
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 GROUPS = {group: tuple(names.split()) for group, names, *_ in _RANGES if group}
-"""Names that stand for several."""
+"""Groups of parameters by their common name."""
 
 
 def read_widths(
-    given: Mapping[str, object], label: str = "uncertainty.{}", length: float = LENGTH
+    widths: Mapping[str, object], label: str = "uncertainty.{}", length: float = LENGTH
 ) -> dict[str, float]:
-    """Half widths of all ranges, of those not in `given` the defaults; see `spread_widths`.
+    """Half widths of all ranges: `widths` (see `expand_widths`) and defaults of the others.
 
-    Zero is none. Defaults of lengths are in proportion to the scene's `length` [m].
+    Zero is no range. Defaults of lengths are proportional to the scene's `length` [m].
     """
     defaults = {
         parameter.name: parameter.default * (length if parameter.unit == "m" else 1)
         for parameter in PARAMETERS
     }
-    return defaults | spread_widths(given, label)
+    return defaults | expand_widths(widths, label)
 
 
-def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
-    """Half widths of the ranges that are given, by parameter; zero leaves one as it is.
+def expand_widths(ranges: Mapping[str, object], label: str) -> dict[str, float]:
+    """Half widths by parameter, with groups replaced by their parameters.
 
-    A parameter's own range counts before that of a group. Messages call a range `label`, which has
-    a place for its name: InputError if a name is unknown, or a width is not a number from zero to
-    what makes sense, below one for relative ones.
+    The range of a parameter takes precedence over that of its group. `label` is the format of a
+    range's name in messages. InputError if a name is unknown, or a width is not a number >= 0, and
+    < 1 if it is relative.
     """
     widths = dict[str, float]()
-    for name, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
+    for name, value in sorted(ranges.items(), key=lambda item: item[0] not in GROUPS):
         key = label.format(name)
         if name not in (*NAMES, *GROUPS):
             raise InputError("", key, f"is unknown; allowed are {', '.join((*GROUPS, *NAMES))}")
@@ -411,13 +411,13 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
 
 
 def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
-    """A scene whose numbers are off by `changes`, relative or in the parameters' units, by name.
+    """The scene with parameters changed by `changes`, relative or in the parameters' units.
 
-    Those of torques and of the start do nothing here.
+    Changes of torques and of the start are ignored.
     """
-    changes, body = defaultdict(float, changes), scene.polygon
-    assert body.inertia is not None
-    mass, inertia = body.mass * (1 + changes["mass"]), body.inertia * (1 + changes["inertia"])
+    changes, polygon = defaultdict(float, changes), scene.polygon
+    assert polygon.inertia is not None
+    mass, inertia = polygon.mass * (1 + changes["mass"]), polygon.inertia * (1 + changes["inertia"])
     first, second = (
         replace(
             finger,
@@ -430,7 +430,7 @@ def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     mu = {part: getattr(scene.friction, part) * (1 + changes[f"friction_{part}"]) for part in parts}
     return replace(
         scene,
-        polygon=replace(body, mass=mass, inertia=inertia),
+        polygon=replace(polygon, mass=mass, inertia=inertia),
         fingers=(first, second),
         friction=Friction(**mu),
     )

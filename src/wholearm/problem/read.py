@@ -1,8 +1,8 @@
 """Problem files: their keys, reading, validation, JSON Schema and a page of all keys.
 
-Most keys are declared where their values are kept, in `Polygon`, `Finger`, `Friction`, `Scene`,
-`Problem`, `Phase` and `Goal`; what else a file has is declared here. Every message names the file
-and the key, says what was given and what is allowed.
+Most keys are declared by the classes that hold their values: `Polygon`, `Finger`, `Friction`,
+`Scene`, `Problem`, `Phase` and `Goal`; the other keys are declared here. Every message names file,
+key, value and allowed values.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ..common.fields import (
     Field,
     collect_keys,
     keys_of,
-    leave,
     name_fields,
     refer,
+    unread,
 )
 from ..common.fields import key as declare
 from ..common.sharing import exclusive
-from ..contacts.closing import close_finger, name_reach, place_flush
+from ..contacts.closing import close_finger, describe_reach, place_flush
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation, describe, find_touching
@@ -51,10 +51,10 @@ from .definition import (
     Phase,
     Problem,
     Until,
+    expand_widths,
     read_widths,
-    spread_widths,
 )
-from .table import NEEDED
+from .table import REQUIRED_KEYS
 
 Table = Mapping[str, Field]
 """Keys of a table by name."""
@@ -66,8 +66,8 @@ OBJECT, FINGER, FRICTION, PHASE, GOAL = (
     name_fields(*keys_of(field).values()) for field in (Polygon, Finger, Friction, Phase, Goal)
 )
 FINGERS = name_fields(
-    declare("1", "The right finger.", leave(refer("finger"))),
-    declare("2", "The left finger.", leave(refer("finger"))),
+    declare("1", "The right finger.", unread(refer("finger"))),
+    declare("2", "The left finger.", unread(refer("finger"))),
 )
 START = name_fields(
     declare(
@@ -76,31 +76,31 @@ START = name_fields(
     declare("x", "Of the centroid [m]; both fingers close on the object.", NUMBER, "length", PLACE),
 )
 UNTIL = name_fields(
-    declare("contact", "", leave(refer("contact")), default=None),
+    declare("contact", "", unread(refer("contact")), default=None),
     declare("x", "[m]", default=None),
     declare("phi_deg", "[degrees]", default=None),
 )
 MODE = name_fields(
     *map(declare, ("t", "x", "phi_deg")),
-    declare("signs", "", leave({"type": "string", "pattern": "^[-+0]+ [-+]{2}$"})),
+    declare("signs", "", unread({"type": "string", "pattern": "^[-+0]+ [-+]{2}$"})),
 )
 UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
 _PARTS = name_fields(
-    *(declare(name, kind=leave(refer(name))) for name in ("object", "fingers", "start")),
-    declare("friction", "Coefficients of friction with the object.", leave(refer("friction"))),
+    *(declare(name, kind=unread(refer(name))) for name in ("object", "fingers", "start")),
+    declare("friction", "Coefficients of friction with the object.", unread(refer("friction"))),
     declare(
         "uncertainty",
         "Ranges of what is not known exactly, for robustness and solve --robust.",
-        leave(refer("uncertainty")),
+        unread(refer("uncertainty")),
         default=None,
     ),
     declare(
         "goal",
         "Where the object shall come to lie, in place of phases; several are visited in order.",
-        leave({"oneOf": [refer("goal"), {"type": "array", "items": refer("goal")}]}),
+        unread({"oneOf": [refer("goal"), {"type": "array", "items": refer("goal")}]}),
         default=None,
     ),
-    declare("phases", kind=leave({"type": "array", "items": refer("phase")}), default=None),
+    declare("phases", kind=unread({"type": "array", "items": refer("phase")}), default=None),
 )
 TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
 _TABLES = {
@@ -111,15 +111,15 @@ _PLACES = {
     "the top of the file": TOP, "[object]": OBJECT, "[fingers.1] and [fingers.2]": FINGER,
     "[start]": START, "[[phases]]": PHASE, "[goal]": GOAL,
 }  # fmt: skip
-"""Tables by their place, as a hint where a key stands in another one."""
+"""Tables by name, for hints about keys in a wrong table."""
 
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
 
 def read_problem(path: str | Path) -> Problem:
-    """Read and validate a problem file; whether each phase can be reached is not checked here.
+    """Read and validate a problem file; reachability of the phases is not checked.
 
-    An `InputError` if it cannot be read, or for the first thing in it that is malformed.
+    An `InputError` if it cannot be read, or for the first malformed value.
     """
     try:
         with open(path, "rb") as stream:
@@ -127,7 +127,7 @@ def read_problem(path: str | Path) -> Problem:
         if content.startswith(b"PK"):
             text = "is no problem file but an archive, as a trajectory is; the problem comes first"
             raise InputError(str(path), "", text)
-        # Editors on Windows may begin a file with a byte order mark.
+        # Editors on Windows may write a byte order mark.
         table = tomllib.loads(content.decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
@@ -136,16 +136,16 @@ def read_problem(path: str | Path) -> Problem:
     except RecursionError:
         raise InputError(str(path), "", "is nested too deeply") from None
     problem = build_problem(table, str(path))
-    for key, needed in NEEDED.items():
-        if key in table and not any(needed in part for part in (table, *table.get("phases", ()))):
-            text = f"{table[key]!r} given without {needed}, and has no effect without it"
+    for key, parent in REQUIRED_KEYS.items():
+        if key in table and not any(parent in part for part in (table, *table.get("phases", ()))):
+            text = f"{table[key]!r} given without {parent}, and has no effect without it"
             raise InputError(str(path), key, text)
     return problem
 
 
 @exclusive
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
-    """The problem of a file's nested tables, or an `InputError` that names `source`."""
+    """The problem from the nested tables of a file, or an `InputError` that names `source`."""
     with name_source(source):
         _table(table, "", TOP)
         polygon = Polygon(**collect_keys(Polygon, _table(table["object"], "object", OBJECT)))
@@ -177,10 +177,10 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
         )
 
 
-def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
-    """The problem whose tables the `meta` of a trajectory carries along.
+def read_stored_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
+    """The problem stored in the `meta` of a trajectory.
 
-    An `InputError` that names `source`, its file, if there is none, or it is malformed.
+    An `InputError` that names the file `source` if there is none, or it is malformed.
     """
     table = meta.get("problem")
     if not isinstance(table, Mapping) or not table:
@@ -191,19 +191,19 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
 
 
 def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
-    """The problem with the phases of the plan with `meta`, where it has goals in their place.
+    """A problem with goals, with the phases of a plan (its `meta`) in their place.
 
-    An `InputError` that names `source`, its file, if it does not hold its problem, or does not end,
-    at `q`, (3,) [m, m, rad], with the last goal.
+    An `InputError` that names the plan's file `source` if the plan does not store its problem, or
+    its end `q`, (3,) [m, m, rad], is not the last goal.
     """
     if not problem.goals:
         return problem
-    goal, (x, _, phi), far = problem.goals[-1], q.tolist(), 1e-3
-    turned = abs(goal.find_angle(problem.scene, phi) - phi) > far
-    if turned or (goal.x is not None and abs(goal.x - x) > far * problem.scene.scales.length):
+    goal, (x, _, phi), tol = problem.goals[-1], q.tolist(), 1e-3
+    rotated = abs(goal.find_angle(problem.scene, phi) - phi) > tol
+    if rotated or (goal.x is not None and abs(goal.x - x) > tol * problem.scene.scales.length):
         place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
         raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
-    return replace(problem, phases=read_own_problem(meta, source).phases, goals=())
+    return replace(problem, phases=read_stored_problem(meta, source).phases, goals=())
 
 
 def _check_edge(scene: Scene, edge: object, key: str) -> None:
@@ -226,16 +226,16 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
     try:
         z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
     except InputError as error:
-        text = f"{error.problem}; {name_reach(scene, float(q[2]))}"
+        text = f"{error.problem}; {describe_reach(scene, float(q[2]))}"
         raise InputError(error.source, error.key, text) from error
     z.setflags(write=False)
     return z
 
 
-def read_phase(scene: Scene, index: int, given: object) -> Phase:
-    """The phase of an entry of `[[phases]]`; an `InputError` for what is none."""
+def read_phase(scene: Scene, index: int, value: object) -> Phase:
+    """The phase of an entry of `[[phases]]`, or an `InputError`."""
     key = f"phases[{index + 1}]"
-    entry = _table(given, key, PHASE)
+    entry = _table(value, key, PHASE)
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
@@ -248,13 +248,13 @@ def read_phase(scene: Scene, index: int, given: object) -> Phase:
     return Phase(index, formation, until, end, entry.get("settle"), guess)
 
 
-def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGuess, ...]:
+def _read_guess(formation: Formation, value: object, key: str) -> tuple[ModeGuess, ...]:
     """The contact modes of an initial guess."""
-    if not isinstance(given, list) or not given:
-        raise InputError("", key, f"{given!r} is not a list of contact modes")
+    if not isinstance(value, list) or not value:
+        raise InputError("", key, f"{value!r} is not a list of contact modes")
     scene, modes = formation.scene, list[ModeGuess]()
     count = formation.n_contacts
-    for row, mode in enumerate(given, start=1):
+    for row, mode in enumerate(value, start=1):
         name = f"{key}[{row}]"
         entry = _table(mode, name, MODE)
         t, x, phi = (
@@ -301,10 +301,10 @@ def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
 
 
 def read_until(scene: Scene, given: object) -> Until:
-    """What ends a phase: the name of a contact, or a table of ``contact``, ``phi_deg`` and ``x``.
+    """Terminal condition: the name of a contact, or a table of ``contact``, ``phi_deg`` and ``x``.
 
-    Without a contact the coordinate with the longest way ends the phase (`Until.lead`); what else
-    is given has to hold there. InputError for anything else.
+    Without a contact, the coordinate that is farthest away ends the phase (`Until.lead`); the
+    others have to hold there. InputError for anything else.
     """
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
@@ -322,18 +322,18 @@ def read_until(scene: Scene, given: object) -> Until:
     return Until(None, coordinate, value, tuple(others))
 
 
-def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
-    """The table at a key, with all the keys that it has to have and no others."""
+def _table(value: object, key: str, fields: Table) -> Mapping[str, Any]:
+    """The table at a key; an `InputError` if a required key is missing or a key is unknown."""
     if not isinstance(value, Mapping):
         raise InputError("", key, f"{value!r} is not a table")
     prefix = f"{key}." if key else ""
     for name in value:
-        if name not in known:
-            allowed = f"allowed are {', '.join(sorted(known))}"
+        if name not in fields:
+            allowed = f"allowed are {', '.join(sorted(fields))}"
             place = next((place for place, table in _PLACES.items() if name in table), "")
-            hint = f"it belongs to {place}; " if place else suggest(name, known)
+            hint = f"it belongs to {place}; " if place else suggest(name, fields)
             raise InputError("", f"{prefix}{name}", f"unknown key; {hint}{allowed}")
-    for name in sorted(name for name, field in known.items() if field.required):
+    for name in sorted(name for name, field in fields.items() if field.required):
         if name not in value:
             raise InputError("", f"{prefix}{name}", "is missing")
     return value
@@ -341,12 +341,12 @@ def _table(value: object, key: str, known: Table) -> Mapping[str, Any]:
 
 @exclusive
 def check_problem(problem: Problem) -> None:
-    """Raise an `InputError` for the first thing that is wrong; curves of phases are not traced."""
+    """Raise an `InputError` for the first invalid value; curves of phases are not traced."""
     check_ranges(problem.scene)
     for attribute, field in keys_of(Problem).items():
         value = field.read(getattr(problem, attribute), field.name)
         field.check(value, field.name, problem.scene)
-    spread_widths(problem.uncertainty or {}, "uncertainty.{}")
+    expand_widths(problem.uncertainty or {}, "uncertainty.{}")
     PLACE.check("start.x", float(problem.start[0]), "m", problem.scene)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
@@ -372,8 +372,8 @@ def check_problem(problem: Problem) -> None:
 
 def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
     if (goal.flush is None) == (goal.phi is None):
-        both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
-        raise InputError("", key, f"{both} given; allowed is one of the two")
+        text = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
+        raise InputError("", key, f"{text} given; allowed is one of the two")
     if goal.phi is not None:
         TURN.check(f"{key}.phi_deg", round(math.degrees(goal.phi), 9), "degrees")
     else:
@@ -383,11 +383,11 @@ def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
 
 
 def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
-    """The goals of a problem file, in the order in which they are visited, or an `InputError`."""
-    given, goals = table.get("goal", []), list[Goal]()
-    several = isinstance(given, list)
-    for index, entry in enumerate(given if several else [given], start=1):
-        key = f"goal[{index}]" if several else "goal"
+    """The goals of a problem file in the order of visits, or an `InputError`."""
+    entries, goals = table.get("goal", []), list[Goal]()
+    is_list = isinstance(entries, list)
+    for index, entry in enumerate(entries if is_list else [entries], start=1):
+        key = f"goal[{index}]" if is_list else "goal"
         if not isinstance(entry, Mapping):
             text = f"{entry!r} given; allowed is a table with flush or phi_deg, and x"
             raise InputError("", key, text)
@@ -400,12 +400,12 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
 
 
 def name_goal(goals: Sequence[Goal], index: int) -> str:
-    """The key of a goal, by its index from 0."""
+    """The key of a goal by its index (from 0)."""
     return "goal" if len(goals) == 1 else f"goal[{index + 1}]"
 
 
 def require_phases(problem: Problem) -> None:
-    """Raise an `InputError` if a problem has no phases, which one for a map does not need."""
+    """Raise an `InputError` if a problem has no phases (a problem for a map needs none)."""
     if not problem.phases:
         text = "is missing, and so is [goal], from which wholearm finds them; "
         text += "`wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
@@ -416,13 +416,13 @@ def require_phases(problem: Problem) -> None:
 
 
 def _check_formation(formation: Formation, key: str) -> None:
-    """Check that contacts are there once, and that those that roll can."""
+    """Check that no contact is repeated, and that rolling contacts have friction."""
     contacts = formation.contacts
     if not contacts:
         raise InputError("", key, "[] is not a list of contact names")
-    twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
-    if twice:
-        raise InputError("", key, f"{', '.join(sorted(twice))} is given twice")
+    repeated = {contact.name for contact in contacts if contacts.count(contact) > 1}
+    if repeated:
+        raise InputError("", key, f"{', '.join(sorted(repeated))} is given twice")
     for row in formation.rolling_rows:
         if formation.friction[row] == 0:
             finger = contacts[row].finger
@@ -444,18 +444,18 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
         raise InputError("", key, "is missing; only a phase with end = 'smooth' has none")
     if until.contact is not None and until.contact in phase.formation.contacts:
         raise InputError("", key, f"{until} is already in the phase's contacts")
-    ends = until.coordinates
-    for coordinate, target in ends:
+    coordinates = until.coordinates
+    for coordinate, target in coordinates:
         if coordinate not in ROWS:
             raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
         value = require_number(target, key)
         if coordinate == "x":
             PLACE.check(key, value, "m", scene)
         else:
-            # Rounding in radians is no matter at the end of the range.
+            # Rounding in radians must not matter at the bounds.
             TURN.check(key, round(math.degrees(value), 9), "degrees")
     freedoms = 5 - phase.formation.n_constraints
-    if len({name for name, _ in ends}) < len(ends):
+    if len({name for name, _ in coordinates}) < len(coordinates):
         raise InputError("", key, f"{until} gives a coordinate twice")
     if 1 < freedoms < (count := until.conditions):
         text = f"{until} gives {count} conditions; allowed are {freedoms}, as the contacts leave"
@@ -463,7 +463,7 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
 
 
 def _check_end(phase: Phase, following: Phase | None) -> None:
-    """Check that a phase passes into the next one as its `end` says."""
+    """Check that the transition `end` of a phase is possible."""
     if phase.end is End.REST:
         return
     key, until = f"phases[{phase.number}].end", phase.until
@@ -475,10 +475,10 @@ def _check_end(phase: Phase, following: Phase | None) -> None:
         raise InputError("", key, f"{end_text}, but until is {until}, not a contact that is gained")
     if phase.end is End.IMPACT and until.contact not in contacts:
         raise InputError("", key, f"{end_text}, but phase {following.number} does not have {until}")
-    before = {*phase.formation.contacts, until.contact}
-    extra = [c.name for c in contacts if c not in before]
-    if extra:
-        text = f"{end_text}, but phase {following.number} has {', '.join(extra)} too"
+    allowed = {*phase.formation.contacts, until.contact}
+    added = [c.name for c in contacts if c not in allowed]
+    if added:
+        text = f"{end_text}, but phase {following.number} has {', '.join(added)} too"
         raise InputError("", key, text)
     same = set(contacts) == set(phase.formation.contacts)
     same = same and set(following.formation.rolling) == set(phase.formation.rolling)
@@ -498,18 +498,18 @@ def _check_fingers(problem: Problem) -> None:
             f"{problem.start[0]:g} closes the fingers into each other: their gap is {gap:.4g} m; "
             "allowed is 0 or more, unless fingers_collide = false; "
         )
-        raise InputError("", "start.x", text + name_reach(scene, float(problem.start[2])))
+        raise InputError("", "start.x", text + describe_reach(scene, float(problem.start[2])))
 
 
 def _check_first_formation(problem: Problem) -> None:
-    """Check that what the first phase names touches; it may let go what else does."""
+    """Check that the contacts of the first phase touch; it may release others."""
     if not problem.phases:
         return
     formation, z = problem.phases[0].formation, problem.start[None]
-    missed = max(np.abs(formation.evaluate(z, z).C).max(), -formation.evaluate_limits(z).min())
-    if missed < problem.scene.touching:
+    violation = max(np.abs(formation.evaluate(z, z).C).max(), -formation.evaluate_limits(z).min())
+    if violation < problem.scene.touching:
         return
-    # Only what a message may need looks at every other contact.
+    # Only for the message: this evaluates all contacts.
     touching = find_touching(problem.scene, problem.start)
     first = formation.contacts
     if not set(first) <= set(touching):
@@ -518,7 +518,7 @@ def _check_first_formation(problem: Problem) -> None:
 
 
 def name_keys() -> dict[str, tuple[str, ...]]:
-    """Short names for `Problem.with_` and the dotted keys that each stands for."""
+    """Short names for `Problem.with_`, and the dotted keys of each."""
     names: dict[str, tuple[str, ...]] = {key: (key,) for key in TOP}
     names |= {key: (f"object.{key}",) for key in OBJECT}
     names |= {key: (f"start.{key}",) for key in START}
@@ -578,7 +578,7 @@ def write_page() -> str:
             if name not in _PARTS:
                 text = re.sub(r" ?\[[^]]*\]", "", field.text)
                 default = "required" if field.required else field.describe_default()
-                allowed = ", ".join(filter(None, (one.describe() for one in field.ranges)))
+                allowed = ", ".join(filter(None, (bounds.describe() for bounds in field.ranges)))
                 lines.append(f"| `{name}` | {field.unit} | {default} | {allowed} | {text} |")
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)

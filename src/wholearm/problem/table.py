@@ -1,4 +1,4 @@
-"""The table of a problem file: made of a problem, changed by name, written as TOML."""
+"""Tables of a problem file: conversion from a problem, changes by name, output as TOML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.document import plain
+from ..common.document import to_plain
 from ..common.errors import InputError, suggest
 from ..common.fields import Field, keys_of
 from ..common.files import require_ending, write_text
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
 
 
-PRINTED = 9  # decimals of an angle in degrees that a printed phase has at most
-NEEDED = {"settle_gap": "settle", "control_hold": "control_period"}
-"""Keys of a file that have no effect without another one."""
+DIGITS = 9  # decimals of an angle in degrees of a printed phase
+REQUIRED_KEYS = {"settle_gap": "settle", "control_hold": "control_period"}
+"""Keys of a file, and the keys without which they have no effect."""
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 
 
 def change_table(
     table: Mapping[str, Any], changes: Mapping[str, Any], names: Mapping[str, Sequence[str]]
 ) -> dict[str, Any]:
-    """Return a copy of the nested tables of a problem file with other values.
+    """Copy of the nested tables of a problem file with other values.
 
-    `changes` are by short name (`names`, see `name_keys`), or by a dotted key as messages write it,
-    such as ``phases[2].until``; None removes a key. InputError if a name is unknown, or a dotted
-    key leads through something that is no table.
+    `changes` are by short name (`names`, see `name_keys`), or by a dotted key as in messages, such
+    as ``phases[2].until``; None removes a key. InputError if a name is unknown, or a part of a
+    dotted key is not a table.
     """
     changed: dict[str, Any] = copy.deepcopy(dict(table))
     owners = dict[str, str]()  # name that changes each key
     for name, value in changes.items():
-        dotted = "." in name or "[" in name
-        if not dotted and name not in names:
+        is_dotted = "." in name or "[" in name
+        if not is_dotted and name not in names:
             allowed = f"allowed are {', '.join(sorted(names))}"
             raise InputError("", name, f"unknown name; {suggest(name, names)}{allowed}")
-        whole = name == "friction" and isinstance(value, Mapping)
-        for key in (name,) if dotted or whole else names[name]:
+        as_table = name == "friction" and isinstance(value, Mapping)
+        for key in (name,) if is_dotted or as_table else names[name]:
             if (other := owners.setdefault(key, name)) != name:
                 raise InputError("", name, f"changes the same number as {other} does; give one")
-            _set(changed, key, plain(value, finite=False))
+            _set(changed, key, to_plain(value, finite=False))
     return changed
 
 
@@ -81,16 +81,16 @@ def _enter(place: Any, step: str | int, key: str) -> Any:
             raise InputError("", key, f"there is no number {step + 1}; the list has {count}")
     elif not isinstance(place, dict) or step not in place:
         keys = list(place) if isinstance(place, dict) else ["no table"]
-        there = f"what is there: {', '.join(keys)}"
-        raise InputError("", key, f"there is no {step!r}; {suggest(step, keys)}{there}")
+        keys_text = f"what is there: {', '.join(keys)}"
+        raise InputError("", key, f"there is no {step!r}; {suggest(step, keys)}{keys_text}")
     return place[step]
 
 
 def write_table(problem: Problem) -> Mapping[str, Any]:
     """The nested tables of a problem file, without defaults.
 
-    Empty where the start is no edge flush on the palm with both fingers closed, which is all that
-    a file can say.
+    Empty if the start is not an edge flush on the palm with both fingers closed: files describe
+    only such starts.
     """
     start = _find_start(problem)
     if start is None:
@@ -98,11 +98,11 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     table: dict[str, Any] = {
         key: value
         for key, value, field in _list_values(("", problem))
-        if field.required or value != field.shown_default
+        if field.required or value != field.default_value
     }
     table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}, "start": start}
     if problem.uncertainty is not None:
-        table["uncertainty"] = plain(problem.uncertainty)
+        table["uncertainty"] = to_plain(problem.uncertainty)
     goals = [
         {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
         for goal in problem.goals
@@ -113,27 +113,27 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     elif problem.phases:
         table["phases"] = [describe_phase(phase) for phase in problem.phases]
     for key, value, field in _list_values(*_list_parts(problem.scene)):
-        if field.required or value != field.shown_default:
+        if field.required or value != field.default_value:
             _set(table, key, value)
-    for key, needed in NEEDED.items():
+    for key, parent in REQUIRED_KEYS.items():
         if key in table:
-            table.setdefault(needed, 0.0)
+            table.setdefault(parent, 0.0)
     return table
 
 
 def to_degrees(angle: float, digits: int = 15) -> float:
-    """An angle [rad] in degrees, with the fewest decimals, at most `digits`, that say the same."""
+    """An angle [rad] in degrees, with the fewest decimals (<= `digits`) that are converted back."""
     rounded = [round(math.degrees(angle), count) for count in range(6, digits + 1)]
-    return next((one for one in rounded if math.radians(one) == angle), rounded[-1])
+    return next((value for value in rounded if math.radians(value) == angle), rounded[-1])
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
-    """Values of a scene by the dotted keys of a problem file; None for what is left out there."""
+    """Values of a scene by the dotted keys of a problem file; None for omitted keys."""
     return {key: value for key, value, _ in _list_values(*_list_parts(scene))}
 
 
 def _list_parts(scene: Scene) -> list[tuple[str, object]]:
-    """Parts of a scene after the prefixes of their keys."""
+    """Pairs of the prefix of the keys and a part of the scene."""
     fingers = [(f"{finger.name}.", finger) for finger in scene.fingers]
     return [("object.", scene.polygon), ("friction.", scene.friction), *fingers, ("", scene)]
 
@@ -142,14 +142,14 @@ def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]
     """Dotted keys, values and declarations of parts of a problem."""
     for prefix, part in parts:
         for attribute, field in keys_of(part).items():
-            value = plain(getattr(part, attribute))
+            value = to_plain(getattr(part, attribute))
             if attribute == "inertia" and isinstance(part, Polygon):
                 value = None if value == part.uniform_inertia else value
             yield f"{prefix}{field.name}", value, field
 
 
 def _find_start(problem: Problem) -> dict[str, Any] | None:
-    """The table of the start, or None if no edge is flush there or a finger is not closed."""
+    """The table of the start; None if no edge is flush on the palm or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
     units = np.array([scene.scales.length, scene.scales.length, 1.0])
     for edge in range(scene.polygon.n_vertices):
@@ -162,7 +162,7 @@ def _find_start(problem: Problem) -> dict[str, Any] | None:
 
 
 def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
-    """A phase as an entry of a file, with angles of at most so many decimals."""
+    """Table of a phase in a file, with angles of at most `digits` decimals."""
     contacts, rolling = phase.formation.contacts, phase.formation.rolling
     entry: dict[str, Any] = {"contacts": [c.name + " rolling" * (c in rolling) for c in contacts]}
     if not phase.until.is_release:
@@ -179,7 +179,7 @@ def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
 
 
 def write_until(until: Until, digits: int) -> Any:
-    """What ends a phase, as its file has it: a name, or a table."""
+    """Value of `until` in a file: the name of a contact, or a table."""
     if until.contact is not None and not until.pins:
         return until.contact.name
     table: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
@@ -189,15 +189,15 @@ def write_until(until: Until, digits: int) -> Any:
 
 
 def format_until(until: Until) -> str:
-    """The value of `until` in a problem file, to read."""
-    return _write(write_until(until, PRINTED))
+    """Value of `until` as text of a problem file."""
+    return _write(write_until(until, DIGITS))
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
-    """Write a problem to a ``.toml`` file, which loads as the same.
+    """Write a problem to a ``.toml`` file, from which it can be loaded.
 
-    InputError if the file cannot be written, or the problem starts where no file can say: with no
-    edge flush on the palm, or a finger that does not touch.
+    InputError if the file cannot be written, or no file can describe the start: no edge is flush
+    on the palm, or a finger does not touch.
     """
     require_ending(path, ".toml")
     if not problem.table:
@@ -206,20 +206,20 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     write_text(path, write_toml(problem.table))
 
 
-def write_toml(table: Mapping[str, Any], where: str = "") -> str:
+def write_toml(table: Mapping[str, Any], prefix: str = "") -> str:
     """Nested tables as TOML: values first, then tables, then lists of tables."""
-    plain, inner = [], []
+    values, tables = [], []
     for key, value in table.items():
-        full = f"{where}{_quote(key)}"
+        full_key = f"{prefix}{_quote(key)}"
         if isinstance(value, Mapping):
-            inner.append(f"\n[{full}]\n{write_toml(value, f'{full}.')}")
+            tables.append(f"\n[{full_key}]\n{write_toml(value, f'{full_key}.')}")
         elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
             for entry in value:
                 lines = (f"{_quote(name)} = {_write(item)}\n" for name, item in entry.items())
-                inner.append(f"\n[[{full}]]\n{''.join(lines)}")
+                tables.append(f"\n[[{full_key}]]\n{''.join(lines)}")
         else:
-            plain.append(f"{_quote(key)} = {_write(value)}\n")
-    return "".join(plain + inner)
+            values.append(f"{_quote(key)} = {_write(value)}\n")
+    return "".join(values + tables)
 
 
 def _quote(key: str) -> str:
@@ -227,7 +227,7 @@ def _quote(key: str) -> str:
 
 
 def _write(value: Any) -> str:
-    """A value, with all digits of a number."""
+    """A value as TOML; numbers with all digits."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_quote(k)} = {_write(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):

@@ -17,19 +17,19 @@ from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory
 
 
-class Moved(Protocol):
-    """What has a trajectory: a plan, a simulation, a report."""
+class MotionLike(Protocol):
+    """Object with a trajectory: a plan, a simulation, a report."""
 
     @property
     def trajectory(self) -> Trajectory:
         """The motion with its forces and torques."""
 
 
-Torques = TorqueProfile | Trajectory | Moved  # what torques can be taken of
+Torques = TorqueProfile | Trajectory | MotionLike  # objects that have torques
 
 
-def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
-    """The torques of a plan, a replay or a trajectory and its motion; None for torques alone."""
+def split_torques(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
+    """Torques and trajectory of a plan, a replay or a trajectory; None for torques alone."""
     if isinstance(what, TorqueProfile):
         return what, None
     trajectory = what if isinstance(what, Trajectory) else getattr(what, "trajectory", None)
@@ -42,11 +42,11 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
 def adopt_torques(
     problem: Problem, what: Torques
 ) -> tuple[Problem, TorqueProfile, Trajectory | None]:
-    """The problem with the phases of a plan, if it has goals, and torques and motion of that.
+    """The problem, with the phases of the plan if it has goals, and torques and motion of the plan.
 
-    InputError if the plan ends elsewhere than at the last goal.
+    InputError if the plan does not end at the last goal.
     """
-    torque, trajectory = narrow(what)
+    torque, trajectory = split_torques(what)
     if trajectory is not None:
         problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1])
     return problem, torque, trajectory
@@ -67,8 +67,8 @@ def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
 def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
     """Check that a plan, if there is one, has the contacts of a problem."""
     contact_names = {contact.name for contact in problem.contacts}
-    if plan is not None and (odd := {*plan.contacts} ^ contact_names):
-        text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
+    if plan is not None and (difference := {*plan.contacts} ^ contact_names):
+        text = f"trajectory and problem differ in {', '.join(sorted(difference))}"
         raise InputError("", "contacts", text)
 
 
@@ -83,15 +83,15 @@ def require_same_phases(problem: Problem, plan: Trajectory) -> None:
 def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
     """Write a motion to a ``.npz`` file, torques as CSV or a problem as TOML, by the ending.
 
-    A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as dense
-    as the torques are bent.
+    A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step; the density of
+    rows follows the curvature of the torques.
 
-    InputError if the file has another ending or cannot be written, or torques alone are to be a
+    InputError if the file has another ending or cannot be written, or torques alone are saved as a
     motion.
     """
     if isinstance(what, Problem):
         return save_problem(what, path)
-    torque, trajectory = narrow(what)
+    torque, trajectory = split_torques(what)
     if require_ending(path, ".npz", ".csv") == ".csv":
         write_text(path, format_rows(place_rows(torque)))
     elif trajectory is None:
@@ -101,11 +101,11 @@ def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
 
 
 _FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle", "guess")
-"""Keys of a problem in which its plans may differ from it; those with a dot at the top only."""
+"""Keys of a problem that may differ in its plans; those with a dot at the top level only."""
 
 
 def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
-    """Check that the plan with this `meta` was made for a problem, and says so."""
+    """InputError if the plan with this `meta` was not made for a problem."""
     if not isinstance(meta.get("problem"), Mapping):
         raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
     if origin := describe_origin(problem, meta, "trajectory"):
@@ -113,36 +113,36 @@ def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
 
 
 def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan") -> str:
-    """What differs from the problem that a plan or a policy was made for, in one line.
+    """Differences between `problem` and the one that a plan or a policy was made for, in one line.
 
-    It is used for `problem`; its `meta` has the tables of its own. The line is empty without these,
-    and if nothing differs.
+    `meta` of the plan has the tables of its problem. The line is empty without tables, and if
+    nothing differs.
 
-    InputError if it makes no sense for the problem: the object has other vertices, by number, or
-    the hand is another one, a base or a length being off by more than a tenth of the link.
+    InputError if the plan cannot be used for the problem: the object has other vertices, or the
+    hand is another one, with a base or a length that differs by more than a tenth of the link.
     """
-    own = meta.get("problem")
-    if not isinstance(own, Mapping) or own == problem.table:
+    table = meta.get("problem")
+    if not isinstance(table, Mapping) or table == problem.table:
         return ""
-    # Phases take the place of goals in plans.
+    # A plan for goals has phases instead.
     free = (*_FREE, ".phases") if "goal" in problem.table else _FREE
-    found = list(find_differences(own, problem.table, free))
-    for difference in found:
-        if other := _find_other(difference, problem):
-            given = f"{difference.one} in the {what}, {difference.other} here"
-            raise InputError("", difference.key, f"{given}; {other}")
-    text = describe_differences(found, f"in the {what}", "here")
+    differences = list(find_differences(table, problem.table, free))
+    for difference in differences:
+        if mismatch := _describe_mismatch(difference, problem):
+            values = f"{difference.one} in the {what}, {difference.other} here"
+            raise InputError("", difference.key, f"{values}; {mismatch}")
+    text = describe_differences(differences, f"in the {what}", "here")
     return f"made for another problem: {text}" if text else ""
 
 
-def _find_other(found: Difference, problem: Problem) -> str:
-    """Of which other scene a difference says that a plan is; empty where it is small enough."""
-    if found.key == "object.vertices":
+def _describe_mismatch(difference: Difference, problem: Problem) -> str:
+    """Sentence if a difference shows that a plan is of another object or hand, or empty."""
+    if difference.key == "object.vertices":
         return "its contacts are those of another polygon"
     for finger in problem.scene.fingers:
-        if found.key.startswith((f"{finger.name}.base", f"{finger.name}.length")):
+        if difference.key.startswith((f"{finger.name}.base", f"{finger.name}.length")):
             with suppress(ValueError):
-                # No error of measurement.
-                if abs(float(found.one) - float(found.other)) > 0.1 * finger.length:
+                # More than an error of measurement.
+                if abs(float(difference.one) - float(difference.other)) > 0.1 * finger.length:
                     return "it is one of another hand"
     return ""

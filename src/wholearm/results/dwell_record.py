@@ -1,13 +1,13 @@
 """Dwell at the ends of phases: constant torques that close contacts and hold at rest.
 
-Between a motion and its dwell torques change at rest, in the least time in which motors that are
-not quick follow: straight from the ones to the others, tau = tau_0 + sigma (tau_1 - tau_0). Where
-motor j has the largest rate R and the lag T, its torque x, counted in the direction of the change
-d, and its command x + T x' within the limit L leave
+Between a motion and its dwell torques change at rest, in the least time that rate limits and lags
+of motors allow, along a straight line, tau = tau_0 + sigma (tau_1 - tau_0). Motor j has the largest
+rate R and the lag T. Its torque x, counted in the direction of the change d, and its command
+x + T x' within the limit L require
 
     sigma' <= R / d,    sigma' <= (L - x_0 - sigma d) / (T d),
 
-so sigma' is the least of straight lines in sigma: it is constant or decays from place to place.
+so sigma' is the minimum of straight lines in sigma: sigma is piecewise linear or exponential.
 """
 
 from __future__ import annotations
@@ -27,132 +27,132 @@ from .trajectory import ModeSpan, Motion, Samples, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class TorqueChange:
-    """How torques change."""
+    """Change of torques in least time."""
 
     before: Array  # (2,) [N m]
     after: Array  # (2,) [N m]
     times: Array  # (n + 1,) [s]: from 0 on
-    levels: Array  # (n + 1,): sigma at these times
+    sigma: Array  # (n + 1,): sigma at these times
     rates: Array  # (n,) [1/s]: its rate of change just after them
-    decays: Array  # (n,) [1/s]: how fast that decays
+    decays: Array  # (n,) [1/s]: decay rates of this rate
 
     @property
     def duration(self) -> float:
-        """How long it takes [s]; 0 if they do not change."""
+        """Duration of the change [s]; 0 if torques do not change."""
         return float(self.times[-1])
 
-    def share(self, t: Array) -> Array:
-        """What is done of it at some times, sigma."""
+    def fraction(self, t: Array) -> Array:
+        """Fraction sigma of the change at some times."""
         t = np.clip(t, 0.0, self.duration)
         k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.rates) - 1)
-        past, decay = t - self.times[k], self.decays[k]
-        fading = -np.expm1(-decay * past) / np.where(decay > 0, decay, 1.0)
-        return np.asarray(self.levels[k] + self.rates[k] * np.where(decay > 0, fading, past))
+        elapsed, decay = t - self.times[k], self.decays[k]
+        decayed = -np.expm1(-decay * elapsed) / np.where(decay > 0, decay, 1.0)
+        return np.asarray(self.sigma[k] + self.rates[k] * np.where(decay > 0, decayed, elapsed))
 
     @property
     def torque(self) -> TorqueProfile:
         """The torques while they change."""
-        fades, lasts = self.decays.max() > 0, np.diff(self.times)
-        counts = [max(math.ceil(n), 1) for n in (lasts * self.decays.max()).tolist()]
+        decaying, durations = self.decays.max() > 0, np.diff(self.times)
+        counts = [max(math.ceil(n), 1) for n in (durations * self.decays.max()).tolist()]
         spans = zip(self.times[:-1], self.times[1:], counts, strict=True)
         breaks = np.concatenate([np.linspace(a, b, n + 1)[:-1] for a, b, n in spans])
         breaks, change = np.append(breaks, self.duration), self.after - self.before
-        # Pieces are as long as the shortest lag at most.
+        # Pieces are not longer than the shortest lag.
         return TorqueProfile.fit(
-            breaks, lambda t: self.before + self.share(t)[:, None] * change, 6 if fades else 1
+            breaks, lambda t: self.before + self.fraction(t)[:, None] * change, 6 if decaying else 1
         )
 
 
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
-    """How torques change from ones to others, both of shape (2,) [N m]."""
-    levels, spans, rates, decays = _divide(scene, before, after)
+    """Change between torques of shape (2,) [N m] in least time."""
+    sigma, spans, rates, decays = _divide(scene, before, after)
     nonempty = spans > 0
     times = np.append(0.0, np.cumsum(spans[nonempty]))
-    levels = np.append(levels[:-1][nonempty], levels[-1])
-    return TorqueChange(before, after, times, levels, rates[nonempty], decays[nonempty])
+    sigma = np.append(sigma[:-1][nonempty], sigma[-1])
+    return TorqueChange(before, after, times, sigma, rates[nonempty], decays[nonempty])
 
 
 def find_change_times(scene: Scene, before: Array, after: Array) -> Array:
-    """How long torques of shape (..., 2) [N m] take to change, as (...) [s]."""
+    """Least durations (...) [s] of changes between torques of shape (..., 2) [N m]."""
     return np.asarray(_divide(scene, before, after)[1].sum(axis=-1))
 
 
 def _divide(scene: Scene, before: Array, after: Array) -> tuple[Array, Array, Array, Array]:
-    """Pieces of the least time: sigma at their ends, and how long, how fast and fading they are."""
+    """Pieces of the change in least time: sigma at their ends, durations, rates and decay rates."""
     limit, lags = scene.torque_limit, np.flatnonzero(scene.actuator_lag)
     step = np.abs(after - before)
-    # A step of a millionth of the limit is none.
-    much = np.asarray((step > 1e-6 * limit).any(axis=-1))
+    # Steps below a millionth of the limit need no time.
+    changing = np.asarray((step > 1e-6 * limit).any(axis=-1))
     step = np.maximum(step, 1e-12 * limit)
-    side = np.where(after < before, -1.0, 1.0)
-    # Without any room between torque and limit it would take for ever.
-    room = np.maximum(limit - side * after, 5e-4 * limit) + step
-    fastest = np.minimum(scene.torque_rate_limit, 1e12 * limit)
-    steady = (fastest / step).min(axis=-1)
+    sign = np.where(after < before, -1.0, 1.0)
+    # Without slack between torque and limit the duration would be infinite.
+    slack = np.maximum(limit - sign * after, 5e-4 * limit) + step
+    rate_limit = np.minimum(scene.torque_rate_limit, 1e12 * limit)
+    constant = (rate_limit / step).min(axis=-1)
     decay = np.array([0.0, *(1 / scene.actuator_lag[lags])])
-    starts = [steady, *((room / step)[..., j] / scene.actuator_lag[j] for j in lags)]
+    starts = [constant, *((slack / step)[..., j] / scene.actuator_lag[j] for j in lags)]
     lines = np.stack(starts, axis=-1)
-    # sigma' = lines - decay sigma: where two of these cross, another one may be the least.
-    places = [np.zeros_like(steady), np.ones_like(steady)]
+    # sigma' = lines - decay sigma: at a crossing of two lines the least one may change.
+    crossings = [np.zeros_like(constant), np.ones_like(constant)]
     for k in range(len(decay)):
         for m in range(k):
             if decay[k] != decay[m]:
                 crossing = (lines[..., k] - lines[..., m]) / (decay[k] - decay[m])
-                places.append(np.clip(crossing, 0.0, 1.0))
-    levels = np.sort(np.stack(places, axis=-1), axis=-1)
-    middles = (levels[..., 1:] + levels[..., :-1]) / 2
+                crossings.append(np.clip(crossing, 0.0, 1.0))
+    sigma = np.sort(np.stack(crossings, axis=-1), axis=-1)
+    middles = (sigma[..., 1:] + sigma[..., :-1]) / 2
     least = np.argmin(lines[..., None, :] - decay * middles[..., None], axis=-1)
     beta = decay[least]
-    rates = np.take_along_axis(lines, least, axis=-1) - beta * levels[..., :-1]
-    way = np.diff(levels)
-    fading = -np.log1p(-beta * way / rates) / np.where(beta > 0, beta, 1.0)
-    spans = np.where(beta > 0, fading, way / rates)
-    return levels, spans * much[..., None], rates, beta
+    rates = np.take_along_axis(lines, least, axis=-1) - beta * sigma[..., :-1]
+    rise = np.diff(sigma)
+    decayed = -np.log1p(-beta * rise / rates) / np.where(beta > 0, beta, 1.0)
+    spans = np.where(beta > 0, decayed, rise / rates)
+    return sigma, spans * changing[..., None], rates, beta
 
 
 class Settling(NamedTuple):
-    """How the end of a phase is held."""
+    """Dwell at the end of a phase."""
 
     phase: int  # its number
-    duration: float  # [s]: zero where no torques hold it
+    duration: float  # [s]: zero if no torques hold it
     tau: tuple[float, float]  # [N m]
-    margin: float  # least of balance, normal forces and accelerations, over what is ample
-    contact: str = ""  # what closes if it is still open; empty if nothing is gained there
-    gap: float = 0.0  # [m]: from which on that was simulated
-    closes: float | None = None  # [s]: when all was closed, but for a hundredth of the gap
+    margin: float  # least of balance, normal forces and accelerations, over saturation values
+    contact: str = ""  # gained contact, which closes if it is still open; empty without one
+    gap: float = 0.0  # [m]: at the start of its simulation
+    closes: float | None = None  # [s]: time at which a hundredth of the gap remains
     left: float = 0.0  # [m]: largest gap at the end
-    speed: float = 0.0  # [m/s]: most with which the contact is reached; 0 if others open before
-    parts: tuple[str, ...] = ()  # contacts that would have to pull in that impact, and part
-    warning: str = ""  # what the torques do not do; empty if nothing
-    share: float = 0.0  # its duration over that of the whole motion without dwells
+    speed: float = 0.0  # [m/s]: largest closing speed of the contact; 0 if others open before
+    parts: tuple[str, ...] = ()  # contacts that would have to pull in the impact, and open
+    warning: str = ""  # failure of the torques, or empty
+    share: float = 0.0  # duration over that of the whole motion without dwells
 
 
 @dataclass(frozen=True, eq=False)
 class HeldMotion:
-    """A motion with rest before it, in which torques change, and after it, in which they hold.
+    """A motion, with rest before it while torques change, and with a dwell after it.
 
-    Contact forces are not known after it.
+    Contact forces are not known in the dwell.
     """
 
     motion: Motion
     pause: TorqueChange | None = None  # of the torques before it
     # (2, n_c) [N]: c_n and c_t before the pause; NaN if other contacts may share in them
     forces: Array = field(default_factory=lambda: np.zeros((2, 0)))
-    dwell: TorqueProfile | None = None  # torques after it, from 0 on; steady in the last piece
+    dwell: TorqueProfile | None = None  # torques after it, from 0 on; constant in the last piece
 
     @property
     def begin(self) -> float:
-        """When the motion begins [s]."""
+        """Start of the motion [s]."""
         return self.pause.duration if self.pause else 0.0
 
     @property
     def end(self) -> float:
-        """When the motion ends [s]."""
+        """End of the motion [s]."""
         return self.begin + self.motion.duration
 
     @property
     def duration(self) -> float:
-        """How long the phase lasts [s]."""
+        """Duration of the phase [s]."""
         return self.end + (self.dwell.duration if self.dwell else 0.0)
 
     @property
@@ -162,7 +162,7 @@ class HeldMotion:
 
     @property
     def modes(self) -> tuple[ModeSpan, ...]:
-        """Its contact modes, if planned in the time domain: the first start with the pause."""
+        """Contact modes of a motion planned in the time domain: the first ones with the pause."""
         return tuple(
             span._replace(start=span.start + self.begin if k else 0.0, stop=span.stop + self.begin)
             for k, span in enumerate(getattr(self.motion, "modes", ()))
@@ -174,9 +174,9 @@ class HeldMotion:
         return self._evaluate(t, t > self.end)
 
     def sample(self, count: int) -> tuple[Array, Samples]:
-        """`count` even rows until the motion ends, and those of the dwell at its ends.
+        """`count` even rows until the motion ends, then rows of the dwell.
 
-        Also one from which on its torques are steady.
+        These are at its ends, and at the time from which on its torques are constant.
         """
         t = np.linspace(0.0, self.end, count)
         if self.dwell is not None:
@@ -184,13 +184,13 @@ class HeldMotion:
         return t, self._evaluate(t, np.arange(len(t)) >= count)
 
     def _evaluate(self, t: Array, held: Flags) -> Samples:
-        """Samples, of which some are those of the dwell."""
+        """Samples at times `t`; those with `held` are in the dwell."""
         samples = self.motion.evaluate(np.clip(t - self.begin, 0.0, self.motion.duration))
         if self.pause is not None:
-            left = np.where(t < self.begin, 1 - self.pause.share(t), 0.0)[:, None]
+            remaining = np.where(t < self.begin, 1 - self.pause.fraction(t), 0.0)[:, None]
             mixed = (
-                np.where(left > 0, left * first + (1 - left) * now, now)
-                for first, now in zip((self.pause.before, *self.forces), samples[3:], strict=True)
+                np.where(remaining > 0, remaining * initial + (1 - remaining) * now, now)
+                for initial, now in zip((self.pause.before, *self.forces), samples[3:], strict=True)
             )
             samples = Samples(*samples[:3], *mixed)
         if self.dwell is None:
@@ -205,14 +205,14 @@ class HeldMotion:
 def assemble(
     motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
 ) -> Trajectory:
-    """Sample motions that follow one another, `samples` rows to a phase and two to its held end."""
+    """Trajectory of consecutive motions, with `samples` rows for each one and two for its dwell."""
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, start = [], [], 0.0
     for motion in motions:
-        whole = motion if isinstance(motion, HeldMotion) else HeldMotion(motion)
-        local, row = whole.sample(samples)
-        rows.append(row.spread(motion.contacts, contacts))
-        times.append(start + local)
+        phase_motion = motion if isinstance(motion, HeldMotion) else HeldMotion(motion)
+        t, row = phase_motion.sample(samples)
+        rows.append(row.expand(motion.contacts, contacts))
+        times.append(start + t)
         start += motion.duration
     columns = Samples(*map(np.concatenate, zip(*rows, strict=True)))
     return Trajectory(

@@ -1,6 +1,6 @@
 """Report of a replay: margins, ends, deviations and energies by phase, as tables.
 
-And what plans record of it, and of lower bounds, impacts and ranges.
+Also records of replays, lower bounds, impacts and ranges in plans.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from ..common.document import Document, Result, Table, fixed
-from .adopt import Moved
+from .adopt import MotionLike
 from .trajectory import Trajectory
 
 DEPARTURE = 1e-3  # largest `Deviation` from a plan, over the scene's length, and in rad
@@ -22,29 +22,29 @@ class Deviation(NamedTuple):
 
     position: float  # [m]: of the coordinates x and y
     angle: float  # [rad]: of phi and the joint angles
-    time: float  # [s]: when the larger of the two was, positions counting over the scene's length
+    time: float  # [s]: of the larger of the two, positions relative to the scene's length
 
     def measure(self, length: float) -> float:
-        """Its size, over the scene's `length` [m] and in rad; zero where none is known."""
+        """The larger of both, over the scene's `length` [m] and in rad; zero if not known."""
         sizes = self.position / length, self.angle
         return max((size for size in sizes if not math.isnan(size)), default=0.0)
 
 
 class ForceAt(NamedTuple):
-    """A contact's forces at an instant, and what torques change of them."""
+    """A contact's forces at an instant, and their derivatives by torques."""
 
     contact: str
-    c_n: float  # c_n, c_t [N]: NaN where they are not determined, at rest
+    c_n: float  # c_n, c_t [N]: NaN at rest, where they are indeterminate
     c_t: float
     per_tau: tuple[float, float]  # [N/(N m)]: d c_n / d tau_1 and d c_n / d tau_2, at that state
 
 
 class TorqueAdvice(NamedTuple):
-    """A change of the torques that mends a loss."""
+    """A change of the torques that avoids a loss."""
 
     change: tuple[float, float]  # of both torques [N m]
-    to: tuple[float, float]  # what they then are [N m]
-    but: str = ""  # what else it spoils, by name; empty if every limit is kept
+    to: tuple[float, float]  # new torques [N m]
+    but: str = ""  # another limit that it violates, by name; empty if every limit is kept
     holds: bool = False  # whether the object then stays at rest
 
     def to_text(self) -> str:
@@ -58,43 +58,43 @@ class TorqueAdvice(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """A contact that is lost, slips or presses with less than epsilon, and what would mend that."""
+    """A contact that is lost, slips or presses too little, and torques that avoid it."""
 
     phase: int  # number of the phase
     contact: str
     kind: str  # {"lost", "slips", "thin"}
     time: float  # [s]
-    at_rest: bool  # whether it was; then forces are those with which it would start to move
+    at_rest: bool  # if it is, forces are those at the start of a motion
     forces: tuple[ForceAt, ...]  # of every contact of the formation
-    # [m/s^2 or rad/s^2]: acceleration towards the end of the phase, and what 1 N m of tau_1 and of
-    # tau_2 adds to it; empty for a release, and where forces are not determined
+    # [m/s^2 or rad/s^2]: acceleration towards the end of the phase, and its derivatives by tau_1
+    # and tau_2 per N m; empty for a release, and if forces are indeterminate
     closing: tuple[float, ...]
-    changes: tuple[TorqueAdvice, ...]  # of one torque, or if that spoils something of both
+    changes: tuple[TorqueAdvice, ...]  # of one torque, or of both if that violates other limits
 
     def to_text(self) -> str:
-        """What would mend it, in a sentence."""
-        what = {"lost": "is lost", "slips": "slips", "thin": "falls below epsilon"}[self.kind]
-        text = f"{self.contact} {what} at t = {self.time:.5g} s, phase {self.phase}"
-        ways = [change.to_text() for change in self.changes]
+        """The loss and the changes that avoid it, in a sentence."""
+        verb = {"lost": "is lost", "slips": "slips", "thin": "falls below epsilon"}[self.kind]
+        text = f"{self.contact} {verb} at t = {self.time:.5g} s, phase {self.phase}"
+        texts = [change.to_text() for change in self.changes]
         if all(change.but for change in self.changes):
-            when = "at this place" if self.at_rest else "in this state, so change them earlier"
-            ways.append(f"no torques keep every limit {when}")
-        return f"{text}: {'; '.join(ways)}"
+            state = "at this place" if self.at_rest else "in this state, so change them earlier"
+            texts.append(f"no torques keep every limit {state}")
+        return f"{text}: {'; '.join(texts)}"
 
 
 class Approach(NamedTuple):
-    """How near a motion that misses the end of a phase has come to it."""
+    """Least distance of a motion from the end of a phase that it does not reach."""
 
     phase: int  # number of the phase
     until: str  # its end
     distance: float  # the least, [m] or [rad]
     unit: str  # {"m", "rad"}
-    time: float  # [s]: when
-    rate: float  # [m/s or rad/s]: how fast the distance was closing then
-    turns: tuple[float, ...]  # [s]: when the motion turned back in this phase
+    time: float  # [s]: of the least distance
+    rate: float  # [m/s or rad/s]: closing speed at that time
+    turns: tuple[float, ...]  # [s]: reversals of the motion in this phase
 
     def to_text(self) -> str:
-        """All of it in a sentence."""
+        """The distance and the reversals, in a sentence."""
         text = (
             f"{self.until} was nearest at t = {self.time:.5g} s, {self.distance:.4g} {self.unit} "
             f"away, then closing at {self.rate:.2g} {self.unit}/s, phase {self.phase}"
@@ -104,9 +104,9 @@ class Approach(NamedTuple):
 
 
 class TuningHelp(NamedTuple):
-    """What helps to tune torques."""
+    """Advice on tuning of torques."""
 
-    losses: tuple[Loss, ...] = ()  # those that end the replay first
+    losses: tuple[Loss, ...] = ()  # losses that end the replay first
     approach: Approach | None = None  # None if the goal is reached, or the last end is a release
 
 
@@ -136,28 +136,28 @@ _ENERGIES = (
     "viscous joint friction", "dry joint friction", "sliding friction", "contacts gained",
     "residual",
 )  # fmt: skip
-"""Tables of a replay: columns by attributes, and what parts of the energy are called."""
+"""Tables of a replay: columns by attributes, and names of the parts of the energy."""
 
 
 class ContactMargin(NamedTuple):
     """The least normal force of one contact in one phase."""
 
     contact: str
-    least: float  # [N]: NaN if the contact was never seen moving
-    time: float  # [s]: when
+    least: float  # [N]: NaN without samples in motion
+    time: float  # [s]: of the least force
     margin: float  # [N]: least - epsilon
 
 
 class UniquenessMargin(NamedTuple):
     """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`).
 
-    A principal minor of the contact matrix K over that without friction: forces are the only ones
-    where all are positive.
+    A principal minor of the contact matrix K over that without friction: forces are unique if all
+    are positive.
     """
 
     value: float
-    contacts: str  # whose minor it is, with the modes of those that do not slide
-    time: float  # [s]: when
+    contacts: str  # contacts of the minor, with the modes of those that do not slide
+    time: float  # [s]: of the least margin
 
 
 class LeastImpulse(NamedTuple):
@@ -171,47 +171,47 @@ class SlipMargin(NamedTuple):
     """The least margin to slipping of one rolling contact in one phase."""
 
     contact: str
-    least: float  # [N]: of mu c_n - |c_t|; NaN if the contact was never seen moving
-    time: float  # [s]: when
+    least: float  # [N]: of mu c_n - |c_t|; NaN without samples in motion
+    time: float  # [s]: of the least margin
 
 
 class FingerGap(NamedTuple):
     """The least gap between the two links."""
 
-    least: float  # [m]: negative where they overlap
-    time: float  # [s]: when
+    least: float  # [m]: negative if they overlap
+    time: float  # [s]: of the least gap
 
 
 class PhaseReport(NamedTuple):
     """One phase of the replay."""
 
     number: int  # from 1
-    until: str  # what ends the phase
-    end: str  # how it passes into the next one: at rest, smoothly or with an impact
+    until: str  # condition of its end
+    end: str  # kind of its end: at rest, smooth or an impact
     start: float  # [s]
     contacts: tuple[ContactMargin, ...]
     rolling: tuple[SlipMargin, ...]  # of the contacts that roll
-    arrival: float | None  # [s]: when its end was reached, None if it was not
-    arrival_rate: float | None  # [m/s or rad/s] towards the end then; None for a release
-    # [m/s]: the largest speed left at an end at rest, angular ones times the scene's length; None
-    # where the phase ends otherwise, or was not ended
+    arrival: float | None  # [s]: time of its end, None if it was not reached
+    arrival_rate: float | None  # [m/s or rad/s]: closing speed at that time; None for a release
+    # [m/s]: largest remaining speed at an end at rest, angular ones times the scene's length; None
+    # for other ends, or if the end was not reached
     end_speed: float | None
-    impact: LeastImpulse | None  # None without one, or if what was planned for was a stop
+    impact: LeastImpulse | None  # None without one, or if a stop was planned
     end_deviation: Deviation | None  # from the plan at the end of the phase; None without a plan
-    deviation: Deviation | None  # and at worst
-    uniqueness_margin: UniquenessMargin | None = None  # None if nothing was seen moving
-    wedged: float | None = None  # [s]: how long friction could have held it; None if not at rest
+    deviation: Deviation | None  # largest one from the plan in the phase
+    uniqueness_margin: UniquenessMargin | None = None  # None without samples in motion
+    wedged: float | None = None  # [s]: time of possible sticking; None if not at rest
 
     @property
     def least_force(self) -> LeastForce | None:
         """The least normal force of all contacts; None if nothing moved."""
-        seen = [one for one in self.contacts if not math.isnan(one.least)]
-        forces = (LeastForce(one.least, one.contact, self.number, one.time) for one in seen)
+        known = [each for each in self.contacts if not math.isnan(each.least)]
+        forces = (LeastForce(each.least, each.contact, self.number, each.time) for each in known)
         return min(forces, key=lambda force: force.value, default=None)
 
 
 class ModeChange(NamedTuple):
-    """A contact or joint that goes on in another mode while the rest moves."""
+    """A change of mode of a contact or joint in motion."""
 
     time: float  # [s]
     phase: int  # number of the phase
@@ -228,16 +228,16 @@ class ReducedState(NamedTuple):
     Phi_2: float  # [N m s]: velocity terms over theta_1'
     Phi_3: float  # [N m]: gravity, dry friction and torques
     theta_1_dot: float  # [rad/s]
-    theta_1_ddot: float  # [rad/s^2]: as the replay has it
+    theta_1_ddot: float  # [rad/s^2]: of the replay
 
     @property
     def residual(self) -> float:
-        """What the equation leaves [N m]."""
+        """Residual of the equation [N m]."""
         return self.Phi_1 * self.theta_1_ddot + self.Phi_2 * self.theta_1_dot + self.Phi_3
 
 
 class Failure(NamedTuple):
-    """Why torques are not good, and in which phase, by its number."""
+    """A reason of failure, with the number of its phase."""
 
     phase: int
     text: str
@@ -253,31 +253,31 @@ class EnergyBalance(NamedTuple):
     dry: float
     contact: float  # by sliding
     impact: float  # by contacts gained at a speed
-    residual: float  # what the equations leave unexplained
+    residual: float  # of the balance
     relative: float  # the residual over the sum of all magnitudes
 
 
 @dataclass(frozen=True, repr=False)
 class Report(Result):
-    """What a replay of torques showed."""
+    """Results of a replay of torques."""
 
     name: str  # the problem's
     epsilon: float  # [N]
-    outcome: str  # how the replay ended, in one sentence
+    outcome: str  # end of the replay, in one sentence
     reached: bool  # whether the goal was reached
-    missed_by: float  # [m or rad]: distance to the last end entered, NaN if that is a release
-    failures: tuple[str, ...]  # why the torques are not good, the most important first
-    failed_phase: int | None  # number of the phase that the first of them is about
-    warnings: tuple[str, ...]  # what is not asked for but worth knowing
-    phases: tuple[PhaseReport, ...]  # those entered
+    missed_by: float  # [m or rad]: distance to the end of the last phase, NaN if it is a release
+    failures: tuple[str, ...]  # reasons of failure, the most important first
+    failed_phase: int | None  # number of the phase of the first failure
+    warnings: tuple[str, ...]  # violations that are no failure
+    phases: tuple[PhaseReport, ...]  # phases that the replay has entered
     energy: EnergyBalance
     finger_gap: FingerGap | None  # None if the fingers lie in different planes
     tolerance: float
     steps: int  # of the simulation
     changes: tuple[ModeChange, ...] = ()  # in the order of time
-    reduced: tuple[ReducedState, ...] = ()  # along the replay, if that was asked for
-    help: TuningHelp = field(default_factory=TuningHelp)  # what helps to tune the torques
-    replay: Moved | None = field(default=None, repr=False, compare=False)  # what is reported on
+    reduced: tuple[ReducedState, ...] = ()  # along the replay, if requested
+    help: TuningHelp = field(default_factory=TuningHelp)  # advice on tuning of the torques
+    replay: MotionLike | None = field(default=None, repr=False, compare=False)  # the simulation
 
     derived = ("ok", "exit_status", "reason")
 
@@ -294,7 +294,7 @@ class Report(Result):
 
     @property
     def reason(self) -> str:
-        """The one sentence behind the verdict: the first failure, or that the goal is reached."""
+        """Reason of the verdict: the first failure, or that the goal is reached."""
         return self.failures[0] if self.failures else self.outcome
 
     @property
@@ -305,7 +305,7 @@ class Report(Result):
 
     @property
     def document(self) -> Document:
-        """The verdict with its reason, then everything else as tables."""
+        """The verdict with its reason, and tables of all results."""
         lines = [f"failure: {text}" for text in self.failures[1:]]
         if self.outcome not in (*self.failures, self.reason):
             lines.append(f"end of the replay: {self.outcome}")
@@ -343,11 +343,11 @@ class Report(Result):
         return self.judge(self.name, self.reason, parts)
 
     def _list_losses(self, force: str) -> Table:
-        """Forces where contacts are lost or slip, and what torques change of them."""
+        """Forces where contacts are lost or slip, and their derivatives by torques."""
         rows: list[Sequence[object]] = []
         for loss in (loss for loss in self.help.losses if loss.kind != "thin"):
-            for at in loss.forces:
-                rows.append((loss.time, f"c_n of {at.contact}", at.c_n, at.c_t, *at.per_tau))
+            for f in loss.forces:
+                rows.append((loss.time, f"c_n of {f.contact}", f.c_n, f.c_t, *f.per_tau))
             if loss.closing:
                 value, *per_tau = loss.closing
                 until = self.phases[loss.phase - 1].until
@@ -361,16 +361,16 @@ class TimeBound:
     """A lower bound of the time of phases that are planned together."""
 
     phases: tuple[int, ...]  # their numbers
-    duration: float  # [s]: what the plan takes for them
-    bound: float | None  # [s]: no motion along their curves takes less; None where nothing is known
-    error: float | None  # [s]: estimate of the bound's own error, which it is lowered by
-    reason: str = ""  # why there is no bound, or empty
+    duration: float  # [s]: of the plan
+    bound: float | None  # [s]: for all motions along their curves; None if not known
+    error: float | None  # [s]: estimated error of the bound, already subtracted from it
+    reason: str = ""  # of a missing bound, or empty
 
     derived = ("gap",)
 
     @property
     def gap(self) -> float | None:
-        """How much longer than the bound the plan takes at most, relative to the bound."""
+        """Relative gap: duration of the plan over the bound, less 1."""
         return None if self.bound is None else self.duration / self.bound - 1
 
 
@@ -407,40 +407,40 @@ class Certificate:
 
 
 class Transition(NamedTuple):
-    """An impact that a problem asks for, and what became of it."""
+    """An impact of a problem, and its result."""
 
     phase: int  # number of the phase that ends
     gained: str  # its `until`
     possible: bool  # whether the motion passes it at speed
-    reason: str  # why not, or empty
-    velocity_ratio: float  # speed after over speed before; NaN where nothing says
+    reason: str  # of a stop, or empty
+    velocity_ratio: float  # speed after over speed before; NaN if not known
     least_impulse: float  # [N s per m/s]: for unit speed before
     least_impulse_contact: str
     speed: float  # [m/s]: before; zero if the motion stops there
-    # [s], [(N m)^2 s] or [N]: how much better than with a stop the objective is of phases planned
-    # together; NaN if the impact is not possible, or there is no plan with a stop
+    # [s], [(N m)^2 s] or [N]: improvement of the objective over a plan with a stop, of phases
+    # planned together; NaN if the impact is not possible, or there is no plan with a stop
     saves: float
 
     @property
     def stop(self) -> str:
-        """Why the motion stops there; empty if it does not."""
+        """Reason of a stop, as text; empty without a stop."""
         return "" if self.possible else f"stops: {self.reason}"
 
 
 class RangeFigures(NamedTuple):
-    """A plan that keeps its limits for all numbers within their ranges."""
+    """Figures of a plan that keeps its limits for all numbers within their ranges."""
 
-    radii: Mapping[str, float]  # half widths of the ranges by name, as they were planned with
+    radii: Mapping[str, float]  # half widths of the ranges by name
     nominal: float  # the objective without ranges
-    largest: float | None = None  # factor on the ranges up to which there is a plan, if looked for
+    largest: float | None = None  # largest factor on the ranges with a plan, if requested
     # the same for each phase, planned with those that impacts join it to; None in the time domain
     phases: tuple[float | None, ...] = ()
-    capped: bool = False  # whether the factor is as large as ranges make sense
-    held: tuple[int, ...] = ()  # numbers of phases whose start friction may hold within the ranges
+    capped: bool = False  # whether the factor is at the largest sensible ranges
+    held: tuple[int, ...] = ()  # numbers of phases that friction may hold at their start
 
 
 class LeastForce(NamedTuple):
-    """A least normal force [N]: of which contact, in which phase, and when [s]."""
+    """A least normal force [N], its contact, phase and time [s]."""
 
     value: float
     contact: str
@@ -453,18 +453,18 @@ class RecordedDeviation(NamedTuple):
 
     m: float
     rad: float
-    s: float = math.nan  # files of earlier versions do not say when
+    s: float = math.nan  # missing in files of earlier versions
 
 
 class ReplayedPhase(NamedTuple):
     """One phase of the replay."""
 
-    arrival: float | None  # [s]: when its end was reached
-    end_speed: float | None  # [m/s]: what is left at an end at rest
-    # end_deviation, deviation: from the plan, at the end of the phase and at worst
+    arrival: float | None  # [s]: time of its end
+    end_speed: float | None  # [m/s]: remaining speed at an end at rest
+    # end_deviation, deviation: from the plan, at the end of the phase and the largest one
     end_deviation: RecordedDeviation | None
     deviation: RecordedDeviation | None
-    least_c_n: LeastForce | None = None  # none in files of earlier versions
+    least_c_n: LeastForce | None = None  # None in files of earlier versions
 
 
 class ReplayFigures(NamedTuple):
@@ -472,6 +472,6 @@ class ReplayFigures(NamedTuple):
 
     least_c_n: LeastForce
     phases: tuple[ReplayedPhase, ...]
-    residual: float  # what the samples leave of the equations of motion, in the scene's own units
+    residual: float  # of the equations of motion at the samples, in the scene's own units
     steps: int  # of the simulation
-    simulations: int | None = None  # replays up to the one that held; None in earlier versions
+    simulations: int | None = None  # replays until the accepted one; None in earlier versions

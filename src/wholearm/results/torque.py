@@ -19,12 +19,12 @@ from ..common.fields import choice
 
 ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
 
-_PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece of torques at which it is looked at
+_PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece at which torques are evaluated
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 COMMANDS = ("command1", "command2")
-"""Columns of what motors that lag are told, so that they make the torques."""
+"""Columns of the commands with which motors with lags produce the torques."""
 COLUMNS = ("t", "tau1", "tau2")
-MOST = 1e30
+MAX_NUMBER = 1e30
 """Largest number in a file of torques or of a trajectory: its square and cube are still numbers."""
 
 
@@ -32,7 +32,7 @@ MOST = 1e30
 class TorqueProfile:
     """Piecewise-polynomial joint torques."""
 
-    breaks: Array  # (k + 1,) [s]: strictly increasing. The torque is smooth between two.
+    breaks: Array  # (k + 1,) [s]: strictly increasing; torques are smooth between them
     # (k, 2, d + 1) [N m]: ascending powers of x = (2 t - t_k - t_k+1) / (t_k+1 - t_k) on piece k
     coefficients: Array
 
@@ -41,13 +41,13 @@ class TorqueProfile:
 
     @property
     def duration(self) -> float:
-        """From the first break to the last [s]."""
+        """Time from the first break to the last [s]."""
         return float(self.breaks[-1] - self.breaks[0])
 
     def at(self, t: Array) -> Array:
-        """Torques at times `t`, shape (n,), as (n, 2) [N m]: at a break, those just after it.
+        """Torques at times `t`, shape (n,), as (n, 2) [N m]; at a break, those just after it.
 
-        Before the first break and after the last one the torque of that end holds.
+        Before the first break and after the last one torques are constant.
         """
         t = np.clip(t, self.breaks[0], self.breaks[-1])
         piece = np.searchsorted(self.breaks[1:-1], t, side="right")
@@ -63,12 +63,12 @@ class TorqueProfile:
 
     @property
     def peaks(self) -> Array:
-        """The largest size of the torques in each piece, at 17 places of it, (k, 2) [N m]."""
+        """The largest absolute torques in each piece, at 17 places of it, (k, 2) [N m]."""
         return np.asarray(np.abs(self.at_places(_PLACES)).max(axis=2))
 
     @property
     def jumps(self) -> Array:
-        """By how much the torques step at each break but the ends, shape (k - 1, 2) [N m]."""
+        """Steps of the torques at the inner breaks, shape (k - 1, 2) [N m]."""
         signs = (-1.0) ** np.arange(self.coefficients.shape[2])
         return np.asarray(self.coefficients[1:] @ signs - self.coefficients[:-1].sum(axis=2))
 
@@ -88,10 +88,10 @@ class TorqueProfile:
         return float(squares @ np.diff(self.breaks) / 2)
 
     def cut(self, start: float, stop: float) -> TorqueProfile:
-        """The same torques from `start` to `stop` [s], those of the ends held beyond them."""
-        near = 1e-12 * max(abs(start), abs(stop))
-        inner = self.breaks[(self.breaks > start + near) & (self.breaks < stop - near)]
-        breaks, degree = np.array([start, *inner, stop]), self.coefficients.shape[2] - 1
+        """The torques from `start` to `stop` [s], constant beyond the present ends."""
+        tolerance = 1e-12 * max(abs(start), abs(stop))
+        inside = self.breaks[(self.breaks > start + tolerance) & (self.breaks < stop - tolerance)]
+        breaks, degree = np.array([start, *inside, stop]), self.coefficients.shape[2] - 1
         return TorqueProfile.fit(breaks, self.at, degree)
 
     @staticmethod
@@ -109,15 +109,15 @@ class TorqueProfile:
 
     @staticmethod
     def chain(profiles: Sequence[TorqueProfile]) -> TorqueProfile:
-        """Profiles that each start at 0, one after the other."""
+        """Concatenation of profiles that each start at 0."""
         breaks, start = [np.zeros(1)], 0.0
         for profile in profiles:
             breaks.append(start + profile.breaks[1:])
             start = float(breaks[-1][-1])
         blocks = [profile.coefficients for profile in profiles]
-        longest = max(block.shape[2] for block in blocks)
-        wide = [np.pad(block, ((0, 0), (0, 0), (0, longest - block.shape[2]))) for block in blocks]
-        return TorqueProfile(np.concatenate(breaks), np.concatenate(wide))
+        size = max(block.shape[2] for block in blocks)
+        padded = [np.pad(block, ((0, 0), (0, 0), (0, size - block.shape[2]))) for block in blocks]
+        return TorqueProfile(np.concatenate(breaks), np.concatenate(padded))
 
     @staticmethod
     def join_rows(rows: Array) -> TorqueProfile:
@@ -138,7 +138,7 @@ def read_torque_csv(path: str | Path) -> TorqueProfile:
     Torques are linear between rows; a repeated time is a step. Lines that begin with ``#`` are
     comments; see `read_notes`.
 
-    InputError if the file cannot be read, a column is missing or there twice, a row has more values
+    InputError if the file cannot be read, a column is missing or repeated, a row has more values
     than columns, one is not a finite number, or the times do not start at 0 and increase.
     """
     path = str(path)
@@ -153,15 +153,15 @@ def read_torque_csv(path: str | Path) -> TorqueProfile:
     for column in COLUMNS:
         if header.count(column) != 1:
             names = ",".join(header) or "an empty file"
-            fault = "is there twice" if column in header else "is missing"
-            text = f"column {fault}; {names} given, {','.join(COLUMNS)} needed"
+            problem = "is there twice" if column in header else "is missing"
+            text = f"column {problem}; {names} given, {','.join(COLUMNS)} needed"
             raise InputError(str(path), column, text)
-    where = {column: header.index(column) for column in COLUMNS}
+    indices = {column: header.index(column) for column in COLUMNS}
     for line, row in numbered[1:]:
         if any(map(str.strip, row[len(header) :])):
             text = f"{len(row)} values on line {line} given; the columns are {','.join(header)}"
             raise InputError(str(path), "", text)
-    values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])
+    values = np.array([_read_row(path, line, row, indices) for line, row in numbered[1:]])
     if len(values) < 2:
         raise InputError(str(path), "t", f"{len(values)} rows given; two or more are needed")
     t = values[:, 0]
@@ -169,11 +169,11 @@ def read_torque_csv(path: str | Path) -> TorqueProfile:
         raise InputError(str(path), "t", f"the first time is {t[0]:g}; it must be 0")
     steps = np.diff(t)
     if (steps < 0).any():
-        at = int(np.argmax(steps < 0)) + 1
-        raise InputError(str(path), "t", f"time goes back from {t[at - 1]:g} to {t[at]:g} s")
-    if (again := (steps[1:] == 0) & (steps[:-1] == 0)).any():
-        at = int(again.argmax()) + 2
-        text = f"{t[at]:g} s is given three times, again on line {numbered[at + 1][0]}"
+        k = int(np.argmax(steps < 0)) + 1
+        raise InputError(str(path), "t", f"time goes back from {t[k - 1]:g} to {t[k]:g} s")
+    if (repeated := (steps[1:] == 0) & (steps[:-1] == 0)).any():
+        k = int(repeated.argmax()) + 2
+        text = f"{t[k]:g} s is given three times, again on line {numbered[k + 1][0]}"
         raise InputError(str(path), "t", f"{text}; twice makes a step")
     if t[-1] == 0.0:
         raise InputError(str(path), "t", "every time is 0; the torques must last")
@@ -181,7 +181,7 @@ def read_torque_csv(path: str | Path) -> TorqueProfile:
 
 
 def read_notes(path: str) -> dict[str, str]:
-    """What comments ``# key = value`` of a CSV file say; an `InputError` if it cannot be read."""
+    """Comments ``# key = value`` of a CSV file; an `InputError` if it cannot be read."""
     with _open(path) as stream:
         comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
     return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
@@ -189,7 +189,7 @@ def read_notes(path: str) -> dict[str, str]:
 
 @contextmanager
 def _open(path: str) -> Iterator[TextIO]:
-    """A CSV file; what is wrong with it is an `InputError`."""
+    """Open a CSV file; its errors become an `InputError`."""
     try:
         with name_file(path), open(path, newline="", encoding="utf-8-sig") as stream:
             yield stream
@@ -197,17 +197,17 @@ def _open(path: str) -> Iterator[TextIO]:
         raise InputError(str(path), "", f"is not CSV: {error}") from None
 
 
-def _read_row(path: str, line: int, row: list[str], where: Mapping[str, int]) -> list[float]:
+def _read_row(path: str, line: int, row: list[str], indices: Mapping[str, int]) -> list[float]:
     values = []
-    for column, index in where.items():
+    for column, index in indices.items():
         text, value = row[index].strip() if index < len(row) else "", math.nan
         with suppress(ValueError):
-            # Python reads 0_6 as 6, and nothing else does.
+            # Python reads 0_6 as 6, which is not CSV.
             value = math.nan if "_" in text else float(text)
         if not math.isfinite(value):
             raise InputError(str(path), column, f"{text!r} on line {line} is not a finite number")
-        if abs(value) > MOST:
-            allowed = f"allowed are -{MOST:g} to {MOST:g}"
+        if abs(value) > MAX_NUMBER:
+            allowed = f"allowed are -{MAX_NUMBER:g} to {MAX_NUMBER:g}"
             raise InputError(str(path), column, f"{text} on line {line} given; {allowed}")
         values.append(value)
     return values
@@ -216,10 +216,10 @@ def _read_row(path: str, line: int, row: list[str], where: Mapping[str, int]) ->
 def place_rows(
     torque: TorqueProfile, error: float = ERROR, rate_limit: Array | None = None
 ) -> Array:
-    """Rows (t, tau_1, tau_2) whose straight lines give torques back, shape (n, 3) [s, N m, N m].
+    """Rows (t, tau_1, tau_2) whose linear interpolation is torques, shape (n, 3) [s, N m, N m].
 
-    Every break of the torques has a row, and two where they step by 1e-6 of the largest or more. An
-    `error`, relative to the largest torque, is what the lines may miss. They keep a rate limit,
+    Every break of the torques has a row, and two at steps of 1e-6 of the largest or more. `error`
+    is the tolerance of the interpolation, relative to the largest torque. It keeps a rate limit,
     (2,) [N m/s], if the torques do.
     """
     peak, breaks = torque.peaks.max(axis=0), torque.breaks
@@ -228,10 +228,10 @@ def place_rows(
         return np.column_stack([breaks[[0, -1]], np.zeros((2, 2))])
     knots = _divide(torque, error * largest)
     steps = breaks[1:-1][np.abs(torque.jumps).max(axis=1) > 1e-6 * largest]
-    at = np.searchsorted(knots, [breaks[0], *steps, breaks[-1]])
-    stretches = [knots[i : j + 1] for i, j in pairwise(at)]
+    indices = np.searchsorted(knots, [breaks[0], *steps, breaks[-1]])
+    stretches = [knots[i : j + 1] for i, j in pairwise(indices)]
     rows = np.concatenate([np.column_stack([k, _fit_lines(torque, k)]) for k in stretches])
-    # Lines through a bend miss it on both sides; no limit is to be missed for that.
+    # Lines near a bend may exceed it: torques are clipped to their own largest values.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)
     if rate_limit is not None:
@@ -242,9 +242,9 @@ def place_rows(
 def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array:
     """Rows with samples of torques at a rate, shape (n, 3) [s, N m, N m].
 
-    Samples are those of the instants k / `rate`, at a step the later ones, until the torques have
-    ended. With the interpolation ``"linear"`` they are joined by straight lines; with ``"hold"``
-    each is held until the next one, and its row is there twice, at both ends of its period.
+    Samples are at the instants k / `rate`, at a step just after it, until the torques end. With the
+    interpolation ``"linear"`` they are joined by straight lines; with ``"hold"`` each is constant
+    until the next one, with two rows, at both ends of its period.
 
     InputError if the rate is not a positive number or gives fewer than two samples, or the
     interpolation is another one.
@@ -253,15 +253,15 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
     rate = require_number(rate, "sample_rate", positive=True)
     start, count = torque.breaks[0], torque.duration * rate
     if not 1 <= count <= 1e7:
-        needed = f"{1 / torque.duration:.4g} to {1e7 / torque.duration:.4g} Hz"
-        raise InputError("", "sample_rate", f"{rate:g} Hz given; allowed are {needed}")
+        allowed = f"{1 / torque.duration:.4g} to {1e7 / torque.duration:.4g} Hz"
+        raise InputError("", "sample_rate", f"{rate:g} Hz given; allowed are {allowed}")
     t = start + np.arange(int(np.ceil(count - 1e-9)) + 1) / rate
-    # A sample within rounding before a step is one after it.
+    # A sample at a step, but for rounding, is one after it.
     tau = torque.at(t * (1 + 1e-15))
     if interpolation == "linear":
         return np.column_stack([t, tau])
-    held = np.repeat(tau[:-1], 2, axis=0)
-    return np.column_stack([np.repeat(t, 2)[1:-1], held])
+    values = np.repeat(tau[:-1], 2, axis=0)
+    return np.column_stack([np.repeat(t, 2)[1:-1], values])
 
 
 def format_rows(rows: Array, commands: Array | None = None) -> str:
@@ -275,27 +275,27 @@ def format_rows(rows: Array, commands: Array | None = None) -> str:
 
 
 def _divide(torque: TorqueProfile, error: float) -> Array:
-    """Breaks of the torques, and places between them where a line would miss more than `error`."""
+    """Breaks of the torques, and places between them for linear interpolation within `error`."""
     breaks, h, x = torque.breaks, np.diff(torque.breaks), _PLACES
     second = np.polynomial.polynomial.polyder(torque.coefficients, 2, axis=2)
-    bends = TorqueProfile(breaks, np.asarray(second)).at_places(_PLACES)
-    # A line over a part of length p misses p^2 / 8 times the second derivative.
-    density = np.sqrt(np.abs(bends).max(axis=1) / (8 * error))
-    inner = (density[:, 1:] + density[:, :-1]) / 2 * np.diff(x)
-    total = np.concatenate([np.zeros((len(h), 1)), np.cumsum(inner, axis=1)], axis=1)
+    curvature = TorqueProfile(breaks, np.asarray(second)).at_places(_PLACES)
+    # The error of a line over a length p is p^2 / 8 times the second derivative.
+    density = np.sqrt(np.abs(curvature).max(axis=1) / (8 * error))
+    weights = (density[:, 1:] + density[:, :-1]) / 2 * np.diff(x)
+    total = np.concatenate([np.zeros((len(h), 1)), np.cumsum(weights, axis=1)], axis=1)
     counts = np.maximum(1, np.ceil(total[:, -1])).astype(int)
     parts = []
     for k, count in enumerate(counts):
-        inside = np.interp(np.linspace(0.0, total[k, -1], count + 1)[1:-1], total[k], x)
-        parts += [breaks[[k]], breaks[k] + h[k] * (inside + 1) / 2]
+        places = np.interp(np.linspace(0.0, total[k, -1], count + 1)[1:-1], total[k], x)
+        parts += [breaks[[k]], breaks[k] + h[k] * (places + 1) / 2]
     return np.append(np.concatenate(parts), breaks[-1])
 
 
 def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
-    """Give lines that are too steep the torques at their ends, in place.
+    """Replace ends of lines that exceed the rate limit by exact torques, in place.
 
-    Near a kink the nearest lines swing about the torques. Lines through points of these are no
-    steeper than they are.
+    Near a kink the best lines oscillate about the torques. Lines through exact torques are not
+    steeper than the torques.
     """
     t, h = rows[:, 0], np.diff(rows[:, 0])[:, None]
     # At a step the earlier row has the torques before it.
@@ -309,16 +309,16 @@ def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
 
 
 def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:
-    """Values at knots, shape (n, 2), of the continuous straight lines nearest to the torques."""
+    """Values at knots, shape (n, 2), of the piecewise linear least-squares fit of the torques."""
     from scipy.linalg import solveh_banded
 
     h = np.diff(knots)
     t = knots[:-1, None] + h[:, None] * (_POINTS + 1) / 2
     tau = torque.at(t.ravel()).reshape(*t.shape, 2) * (_WEIGHTS * h[:, None] / 2)[..., None]
-    later = (_POINTS + 1) / 2
-    right = np.zeros((len(knots), 2))
-    right[:-1] += np.einsum("knj,n->kj", tau, 1 - later)
-    right[1:] += np.einsum("knj,n->kj", tau, later)
+    fraction = (_POINTS + 1) / 2
+    moments = np.zeros((len(knots), 2))
+    moments[:-1] += np.einsum("knj,n->kj", tau, 1 - fraction)
+    moments[1:] += np.einsum("knj,n->kj", tau, fraction)
     diagonal = (np.append(h, 0.0) + np.append(0.0, h)) / 3
-    # The upper diagonal begins with a place that is not used.
-    return np.asarray(solveh_banded([np.append(0.0, h / 6), diagonal], right))
+    # The first entry of the upper diagonal is not used.
+    return np.asarray(solveh_banded([np.append(0.0, h / 6), diagonal], moments))

@@ -16,7 +16,7 @@ from ..common.arrays import Array, Flags, Numbers, sort_unique
 from ..common.document import Drawn, restore
 from ..common.errors import InputError
 from ..common.files import read_arrays, require_ending, write_text, write_whole
-from .torque import MOST, TorqueProfile, format_rows, place_rows
+from .torque import MAX_NUMBER, TorqueProfile, format_rows, place_rows
 
 ROLLS = "rolls"  # mode of a contact that rolls; one that slides has the sign of its direction
 _PARTS = slice(3), slice(3, 5)  # of z: q and theta
@@ -28,7 +28,7 @@ class ModeSpan(NamedTuple):
     start: float  # start, stop [s]: from the start of the phase
     stop: float
     contacts: Mapping[str, str]  # ``"+"``, ``"-"`` or ``"rolls"`` by the name of the contact
-    joints: tuple[str, ...]  # which way each joint turns, ``"+"`` or ``"-"``
+    joints: tuple[str, ...]  # direction of each joint, ``"+"`` or ``"-"``
 
 
 class Samples(NamedTuple):
@@ -41,10 +41,10 @@ class Samples(NamedTuple):
     c_n: Array  # c_n, c_t (n, n_c) [N]: in the order of the formation's contacts
     c_t: Array
 
-    def spread(self, own: Sequence[str], contacts: Sequence[str]) -> Samples:
-        """The forces of `own` contacts in the columns of all `contacts`, NaN in the others."""
+    def expand(self, names: Sequence[str], contacts: Sequence[str]) -> Samples:
+        """The forces of `names` contacts in the columns of all `contacts`, NaN in the others."""
         forces = np.full((2, len(self.z), len(contacts)), np.nan)
-        forces[:, :, [contacts.index(name) for name in own]] = self.c_n, self.c_t
+        forces[:, :, [contacts.index(name) for name in names]] = self.c_n, self.c_t
         return Samples(*self[:4], *forces)
 
 
@@ -53,7 +53,7 @@ class Motion(Protocol):
 
     @property
     def duration(self) -> float:
-        """How long the phase lasts [s]."""
+        """Duration of the phase [s]."""
 
     @property
     def contacts(self) -> tuple[str, ...]:
@@ -77,23 +77,23 @@ class _Columns:
 class Trajectory(Drawn):
     """A planned motion: samples for files and plots, motions for any instant."""
 
-    # (n,) [s]: even within each phase of a plan; a time is there twice where torques and forces
-    # step: between phases, where the end of one begins to be held, and anywhere in a replay
+    # (n,) [s]: even in each phase of a plan; a time is repeated where torques and forces step:
+    # between phases, at the start of a dwell, and anywhere in a replay
     t: Array
     z: Array  # z, z_dot, z_ddot (n, 5): degrees of freedom (q, theta) and their derivatives
     z_dot: Array
     z_ddot: Array
     tau: Array  # (n, 2) [N m]
     contacts: tuple[str, ...]  # every contact of the plan
-    # (n, m) [N]: NaN where a contact is not in the formation, or at rest, where none is determined
+    # (n, m) [N]: NaN if a contact is not in the formation, and at rest, where it is indeterminate
     c_n: Array
     c_t: Array
     phase: Numbers  # (n,): index of the phase, from 0
     torque: TorqueProfile  # exact between samples, with every step at a break
-    # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant,
-    # those of a loaded plan with z and z' as interpolated; all others interpolate the samples.
+    # one per phase. Planned ones satisfy the equations of motion at any instant, those of a loaded
+    # plan with interpolated z and z'; all others interpolate the samples.
     motions: tuple[Motion, ...]
-    meta: Mapping[str, Any]  # status, epsilon, the problem, and of a plan all else that it says
+    meta: Mapping[str, Any]  # status, epsilon, the problem, and all further values of a plan
 
     # q: pose of the centroid, (n, 3) [m, m, rad]; theta: joint angles, (n, 2) [rad]
     q, theta = (_Columns("z", part) for part in _PARTS)
@@ -108,103 +108,103 @@ class Trajectory(Drawn):
 
     @property
     def duration(self) -> float:
-        """How long the motion lasts [s]."""
+        """Duration of the motion [s]."""
         return float(self.t[-1])
 
     @property
     def phase_starts(self) -> Array:
-        """When each phase starts, and when the last one ends, shape (n_phases + 1,) [s]."""
+        """Start of each phase, and end of the last one, shape (n_phases + 1,) [s]."""
         first = np.flatnonzero(np.diff(self.phase, prepend=-1))
         return np.append(self.t[first], self.t[-1])
 
     @property
     def held(self) -> Flags:
-        """Where everything waits at rest, and no forces are known, shape (n,)."""
+        """Whether rows are at rest, without known forces, shape (n,)."""
         return np.asarray(np.isnan(self.c_n).all(axis=1))
 
     @property
     def rolling(self) -> Flags:
-        """Which contacts roll, shape (n, m), as `meta` names them by phases and modes."""
+        """Whether contacts roll, shape (n, m), by the phases and modes in `meta`."""
         mask, starts = np.zeros(self.c_t.shape, dtype=bool), self.phase_starts
         for index, names in enumerate(self.meta.get("rolling", [])):
             mask[self.phase == index] = [name in names for name in self.contacts]
         for index, modes in enumerate(self.meta.get("modes", [])):
             for mode in modes:
-                passed = np.where(self.phase == index, self.t - starts[index], np.nan)
-                rows = (passed >= mode["start"]) & (passed <= mode["stop"])
+                elapsed = np.where(self.phase == index, self.t - starts[index], np.nan)
+                rows = (elapsed >= mode["start"]) & (elapsed <= mode["stop"])
                 mask[rows] |= [mode["contacts"].get(name) == "rolls" for name in self.contacts]
         return mask
 
     @property
     def least_forces(self) -> list[tuple[float, str]]:
-        """The least c_n [N] of each phase and its contact: in a plan's replay, else at the samples.
+        """The least c_n [N] of each phase and its contact: of a plan's replay, else of the samples.
 
-        NaN and no contact where no forces are known.
+        NaN and no contact if no forces are known.
         """
-        found = []
+        forces = []
         for index in range(len(self.motions)):
             c_n = self.c_n[self.phase == index]
             least = int(np.where(np.isnan(c_n), np.inf, c_n).argmin())
             value = float(c_n.flat[least])
-            found.append((value, self.contacts[least % c_n.shape[1]] if value == value else ""))
+            forces.append((value, self.contacts[least % c_n.shape[1]] if value == value else ""))
         for index, phase in enumerate((self.meta.get("replay") or {}).get("phases", ())):
-            if known := phase.get("least_c_n"):
-                found[index] = known["value"], known["contact"]
-        return found
+            if stored := phase.get("least_c_n"):
+                forces[index] = stored["value"], stored["contact"]
+        return forces
 
     @property
     def largest_torques(self) -> list[float]:
-        """The largest torque of a joint in each phase [N m], between samples, too."""
+        """The largest torque of a joint in each phase [N m], at and between samples."""
         breaks = self.torque.breaks
-        owner = np.searchsorted(self.phase_starts[1:-1], (breaks[1:] + breaks[:-1]) / 2)
+        phase_index = np.searchsorted(self.phase_starts[1:-1], (breaks[1:] + breaks[:-1]) / 2)
         peaks = self.torque.peaks.max(axis=1)
-        return [float(peaks[owner == index].max()) for index in range(len(self.motions))]
+        return [float(peaks[phase_index == index].max()) for index in range(len(self.motions))]
 
     def at(self, t: ArrayLike) -> Samples:
         """The motion at some times, shape (n,) or a number [s], each field of shape (n, ...).
 
-        At a phase boundary the later phase answers. The contacts are all of the trajectory's;
-        forces are NaN where a contact is not in the formation.
+        At a phase boundary values are those of the later phase. Contacts are all those of the
+        trajectory; forces are NaN if a contact is not in the formation.
 
         ValueError if one of the times is outside the trajectory.
         """
         times, starts = np.atleast_1d(np.asarray(t, dtype=float)), self.phase_starts
         inside = (times >= starts[0]) & (times <= starts[-1])
         if not inside.all():
-            wrong = times[~inside][0]
-            raise ValueError(f"t = {wrong} s is outside the trajectory, 0 to {starts[-1]} s")
-        owner = np.searchsorted(starts[1:-1], times, side="right")
+            time = times[~inside][0]
+            raise ValueError(f"t = {time} s is outside the trajectory, 0 to {starts[-1]} s")
+        phase_index = np.searchsorted(starts[1:-1], times, side="right")
         widths = 5, 5, 5, 2, len(self.contacts), len(self.contacts)
         fields = Samples(*(np.empty((len(times), width)) for width in widths))
-        for index in sorted(set(owner.tolist())):
-            motion, rows = self.motions[index], owner == index
+        for index in sorted(set(phase_index.tolist())):
+            motion, rows = self.motions[index], phase_index == index
             part = motion.evaluate(times[rows] - starts[index])
-            part = part.spread(motion.contacts, self.contacts)
-            for whole, values in zip(fields, part, strict=True):
-                whole[rows] = values
+            part = part.expand(motion.contacts, self.contacts)
+            for table, values in zip(fields, part, strict=True):
+                table[rows] = values
         return fields
 
     def find_steps(self) -> Numbers:
         """Rows before which forces step, shape (k,).
 
-        At a new phase, a step of the torques, and where a sliding direction is reversed. Steps of
-        torques below a tenth of the largest cannot be seen.
+        At a new phase, a step of the torques, and a reversal of sliding. Steps of torques below a
+        tenth of the largest are too small for figures.
         """
         torque, t = self.torque, self.t
         stepping = np.abs(torque.jumps).max(axis=1) > 0.1 * np.abs(torque.coefficients).max()
         breaks = torque.breaks[1:-1]
-        inner = np.abs(breaks[:, None] - self.phase_starts).min(axis=1) > 1e-9 * self.duration
-        # Where a time is there twice, in a replay, the step is between the two rows.
+        inside = np.abs(breaks[:, None] - self.phase_starts).min(axis=1) > 1e-9 * self.duration
+        # At a repeated time, in a replay, the step is between the two rows.
         repeated = np.flatnonzero(np.diff(t) == 0) + 1
-        single = np.setdiff1d(breaks[stepping & inner], t[repeated])
+        single = np.setdiff1d(breaks[stepping & inside], t[repeated])
         steps = np.searchsorted(t, single, side="right")
         phases = np.append(np.flatnonzero(np.diff(self.phase)) + 1, repeated)
-        # Friction passes zero without a step where a contact rolls, and together with c_n.
-        slid = np.where(self.rolling, 0.0, self.c_t * self.c_n)
-        turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
-        every = sort_unique(np.concatenate([steps, phases, turns]))
-        # Torques may go on after a motion that has failed.
-        return every[every < len(t)]
+        # Friction passes zero without a step if a contact rolls, and together with c_n.
+        friction = np.where(self.rolling, 0.0, self.c_t * self.c_n)
+        reversals = np.flatnonzero((friction[1:] * friction[:-1] < 0).any(axis=1)) + 1
+        rows = sort_unique(np.concatenate([steps, phases, reversals]))
+        # Torques may extend beyond a motion that has failed.
+        return rows[rows < len(t)]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a ``.npz`` file.
@@ -227,7 +227,7 @@ class Trajectory(Drawn):
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """A phase known by its torques and samples: quintic in time for z, linear for forces."""
+    """A phase interpolated between samples: quintic in time for z, linear for forces."""
 
     t: Array
     contacts: tuple[str, ...]
@@ -236,19 +236,19 @@ class SampledMotion:
 
     @property
     def duration(self) -> float:
-        """How long the phase lasts [s]."""
+        """Duration of the phase [s]."""
         return float(self.t[-1] - self.t[0])
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         samples, k = self.samples, self.locate(t)
-        h, run = self.t[k + 1] - self.t[k], np.asarray(t) - (self.t[k] - self.t[0])
-        z, z_dot, z_ddot = interpolate_quintic(h, run, samples[:3], k)
-        x, (first, last) = (run / h)[:, None], self.t[[0, -1]]
+        h, elapsed = self.t[k + 1] - self.t[k], np.asarray(t) - (self.t[k] - self.t[0])
+        z, z_dot, z_ddot = interpolate_quintic(h, elapsed, samples[:3], k)
+        x, (first, last) = (elapsed / h)[:, None], self.t[[0, -1]]
         forces = [(1 - x) * f[k] + x * f[k + 1] for f in (samples.c_n, samples.c_t)]
-        # Breaks at both ends of the phase are off by rounding.
-        hair = 8 * np.spacing(last)
-        tau = self.torque.at(np.clip(first + np.asarray(t), first + hair, last - hair))
+        # Breaks at both ends of the phase have rounding errors.
+        rounding = 8 * np.spacing(last)
+        tau = self.torque.at(np.clip(first + np.asarray(t), first + rounding, last - rounding))
         return Samples(z, z_dot, z_ddot, tau, *forces)
 
     def locate(self, t: Array) -> Numbers:
@@ -258,25 +258,25 @@ class SampledMotion:
 
 
 def interpolate_quintic(
-    h: Array, run: Array, knots: Sequence[Array], left: Numbers
+    h: Array, elapsed: Array, knots: Sequence[Array], left: Numbers
 ) -> tuple[Array, Array, Array]:
     """Quintic through z, z' and z'' at two knots, with its first two derivatives.
 
     Parameters
     ----------
-    h, run : (n,) [s]  time between the two knots, and since the first of them
+    h, elapsed : (n,) [s]  time between the two knots, and since the first of them
     knots : (m, 5)     z, z' and z'' at all knots
     left : (n,)        the first of the two knots
     """
-    h, x = h[:, None], (run / h)[:, None]
+    h, x = h[:, None], (elapsed / h)[:, None]
     z, v, a = knots
     z0, v0, a0 = z[left], h * v[left], h**2 * a[left]
     rise = z[left + 1] - z0 - v0 - a0 / 2
     speed = h * v[left + 1] - v0 - a0
-    bend = h**2 * a[left + 1] - a0
-    c3 = 10 * rise - 4 * speed + bend / 2
-    c4 = -15 * rise + 7 * speed - bend
-    c5 = 6 * rise - 3 * speed + bend / 2
+    jump = h**2 * a[left + 1] - a0
+    c3 = 10 * rise - 4 * speed + jump / 2
+    c4 = -15 * rise + 7 * speed - jump
+    c5 = 6 * rise - 3 * speed + jump / 2
     return (
         z0 + x * (v0 + x * (a0 / 2 + x * (c3 + x * (c4 + x * c5)))),
         (v0 + x * (a0 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))) / h,
@@ -292,9 +292,9 @@ def sample_phases(
     for index in sort_unique(phase):
         rows = phase == index
         parts = [values[rows] for values in samples]
-        held = ~np.isnan(parts[4]).all(axis=0)
-        own = Samples(*parts[:4], *(forces[:, held] for forces in parts[4:]))
-        motions.append(SampledMotion(t[rows], tuple(compress(contacts, held)), own, torque))
+        present = ~np.isnan(parts[4]).all(axis=0)
+        part = Samples(*parts[:4], *(forces[:, present] for forces in parts[4:]))
+        motions.append(SampledMotion(t[rows], tuple(compress(contacts, present)), part, torque))
     return tuple(motions)
 
 
@@ -331,8 +331,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise InputError(source, "meta", "is nested too deeply") from None
     if not isinstance(meta, dict):
         raise InputError(source, "meta", "is not a JSON object")
-    named = meta.get("rolling", [])
-    if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
+    rolling = meta.get("rolling", [])
+    if not isinstance(rolling, list) or not all(isinstance(names, list) for names in rolling):
         raise InputError(source, "meta.rolling", "is not a list of names for each phase")
     try:
         restore(tuple[tuple[ModeSpan, ...], ...], meta.get("modes", []))
@@ -351,10 +351,10 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
     array = arrays[name]
     rows = arrays["t"].size if name in _ARRAYS else -1
-    needed = rows, *((arrays["contacts"].size,) if name in ("c_n", "c_t") else tail)
-    pairs = zip(needed, array.shape, strict=False)
-    if array.ndim != len(needed) or not all(size in (-1, n) for size, n in pairs):
-        text = ", ".join(str(n) if n >= 0 else "any" for n in needed)
+    expected = rows, *((arrays["contacts"].size,) if name in ("c_n", "c_t") else tail)
+    pairs = zip(expected, array.shape, strict=False)
+    if array.ndim != len(expected) or not all(size in (-1, n) for size, n in pairs):
+        text = ", ".join(str(n) if n >= 0 else "any" for n in expected)
         raise InputError(source, name, f"shape {array.shape} given, ({text}) needed")
     if name == "contacts":
         if array.dtype.kind != "U":
@@ -363,10 +363,10 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
         raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
-    # Nothing in a problem is farther away, or turned more.
-    most = 1e6 if name in ("q", "theta") else MOST
-    if name != "contacts" and (np.abs(array.astype(float)) > most).any():
-        raise InputError(source, name, f"holds numbers beyond {most:g}, the largest allowed")
+    # Problems have no larger distances or angles.
+    largest = 1e6 if name in ("q", "theta") else MAX_NUMBER
+    if name != "contacts" and (np.abs(array.astype(float)) > largest).any():
+        raise InputError(source, name, f"holds numbers beyond {largest:g}, the largest allowed")
 
 
 def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
@@ -376,16 +376,16 @@ def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
     in_order = len(phase) and phase[0] == 0 and ((rises == 0) | (rises == 1)).all()
     if not in_order or np.bincount(phase.astype(int)).min() < 2:
         raise InputError(source, "phase", "must count up from 0, with two or more rows to a phase")
-    steps, inside = np.diff(t), np.diff(phase) == 0
-    stays = inside & (steps == 0)
-    # Forces step where a time is given twice, which is not at the end of a phase.
-    last = np.append(inside[1:], False)
-    if t[0] != 0 or (steps < 0).any() or (stays & (np.append(stays[1:], False) | ~last)).any():
+    steps, same_phase = np.diff(t), np.diff(phase) == 0
+    repeats = same_phase & (steps == 0)
+    # A repeated time is a step of forces, which cannot be at the end of a phase.
+    last = np.append(same_phase[1:], False)
+    if t[0] != 0 or (steps < 0).any() or (repeats & (np.append(repeats[1:], False) | ~last)).any():
         text = "must start at 0 and increase within each phase, a time given twice being a step"
         raise InputError(source, "t", text)
     breaks = arrays["torque_breaks"]
     if len(breaks) < 2 or (np.diff(breaks) <= 0).any():
         raise InputError(source, "torque_breaks", "must be two or more, and increase")
     if len(arrays["torque_coefficients"]) != len(breaks) - 1:
-        count, needed = len(arrays["torque_coefficients"]), len(breaks) - 1
-        raise InputError(source, "torque_coefficients", f"{count} pieces given, {needed} needed")
+        count, expected = len(arrays["torque_coefficients"]), len(breaks) - 1
+        raise InputError(source, "torque_coefficients", f"{count} pieces given, {expected} needed")

@@ -1,1 +1,1 @@
-"""What does not move by plan: object, fingers, friction, gravity."""
+"""Data model of the mechanical system: object, fingers, friction, gravity."""

@@ -1,4 +1,4 @@
-"""The data model: a polygon, a hand of a palm and two fingers, friction and gravity; their ranges.
+"""Data model of a scene: polygon, palm and two fingers, friction, gravity; allowed ranges.
 
 The notation of all docstrings, such as q, theta, z, C, A, A_t, c, P, G and M5, is that of
 `mechanics/README.md`. Finger 1 (index 0) is the right one, finger 2 (index 1) the left one. The
@@ -34,9 +34,9 @@ from ..common.fields import (
     read_keys,
 )
 
-# Ranges of the numbers of a problem, most of them relative to one another. Inside them planning and
-# simulation are meant to work, in any units: sizes and masses span decades, and what counts is how
-# heavy, strong and quick a hand is for its object. Outside, a number is taken for a mistake.
+# Allowed ranges of the numbers of a problem, most of them relative to others: sizes and masses
+# span decades, and what counts is how heavy, strong and fast the hand is for its object. Inside the
+# ranges planning and simulation should work, in any units; numbers outside are taken for mistakes.
 _SIZE, _DRIVE = "times the object's size", "times the torque limit or m g length"
 
 
@@ -45,14 +45,14 @@ def _get_drive(scene: Any, finger: Any) -> float:
 
 
 def _get_strength(scene: Any, finger: Any) -> float | None:
-    """The torque with which finger 1 presses with its tip like finger 2; None for finger 2."""
+    """Torque of finger 1 for the largest tip force of finger 2; None for finger 2."""
     right, left = scene.fingers
     return left.torque_limit / left.length * right.length if finger is right else None
 
 
 def _get_press(scene: Any, _: object) -> float:
-    press = (finger.torque_limit / finger.length for finger in scene.fingers)
-    return float(max(scene.weight, *press))
+    forces = (finger.torque_limit / finger.length for finger in scene.fingers)
+    return float(max(scene.weight, *forces))
 
 
 FRICTION = Range(0.0, 10.0)
@@ -73,38 +73,38 @@ EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
 
 def check_ranges(scene: Scene) -> None:
     """Raise an `InputError` for the first number of a scene that is out of its range."""
-    parts: list[list[tuple[str, Any]]] = [
+    groups: list[list[tuple[str, Any]]] = [
         [("object.", scene.polygon)],
         [("", scene)],
         [("friction.", scene.friction)],
         [(f"{finger.name}.", finger) for finger in scene.fingers],
     ]
-    for owners in parts:
+    for owners in groups:
         for attribute, entry in keys_of(owners[0][1]).items():
-            for one, (prefix, owner) in product(entry.ranges, owners):
+            for bounds, (prefix, owner) in product(entry.ranges, owners):
                 key = f"{prefix}{entry.name}"
-                one.check(key, getattr(owner, attribute), entry.unit, scene, owner)
+                bounds.check(key, getattr(owner, attribute), entry.unit, scene, owner)
 
 
 def find_unit_hint(scene: Scene) -> str:
-    """What looks as if it were in mm or ms, with the key first; empty where nothing does."""
+    """Message about a value that may be in mm or ms, with the key first; empty if there is none."""
     size, time = scene.polygon.size, scene.scales.time
     # A sheet of paper has 0.08 kg/m^2.
     if size > 2.0 and scene.polygon.mass < 0.01 * size**2:
         return f"object.vertices: {size:g} m across at {scene.polygon.mass:g} kg; are they in mm?"
     if scene.control_period > time:
-        many = scene.control_period / time
-        text = f"{scene.control_period:g} s is {many:.3g} times a fall over the radius of gyration"
+        ratio = scene.control_period / time
+        text = f"{scene.control_period:g} s is {ratio:.3g} times a fall over the radius of gyration"
         return f"control_period: {text}; is it in ms?"
     return ""
 
 
-def _read_corners(given: object, key: str) -> Array:
-    if not isinstance(given, list | tuple | np.ndarray):
-        raise InputError("", key, f"{given!r} is not a list of 3 or more points")
-    if not 3 <= len(given) <= 500:
-        raise InputError("", key, f"{len(given)} corners given; allowed are 3 to 500")
-    return frozen([POINT.read(point, f"{key}[{k + 1}]") for k, point in enumerate(given)])
+def _read_corners(points: object, key: str) -> Array:
+    if not isinstance(points, list | tuple | np.ndarray):
+        raise InputError("", key, f"{points!r} is not a list of 3 or more points")
+    if not 3 <= len(points) <= 500:
+        raise InputError("", key, f"{len(points)} corners given; allowed are 3 to 500")
+    return frozen([POINT.read(point, f"{key}[{k + 1}]") for k, point in enumerate(points)])
 
 
 CORNERS = FieldKind(
@@ -135,15 +135,15 @@ class Polygon:
     vertices: Array = field(init=False, repr=False)
     # (2,) [m]: the centroid in the frame of `points`
     centroid: Array = field(init=False, repr=False)
-    # [kg m^2]: what the inertia about the centroid would be for uniform density
+    # [kg m^2]: inertia about the centroid for uniform density
     uniform_inertia: float = field(init=False, repr=False)
     size: float = field(init=False, repr=False)  # [m]: largest distance between two corners
 
     def __post_init__(self) -> None:
         read_keys(self, "object.")
         corners = np.asarray(self.points)
-        least, largest, far = 1e-4, 1e3, float(np.abs(corners).max())
-        if far > 1e3 * largest:
+        least, largest, extent = 1e-4, 1e3, float(np.abs(corners).max())
+        if extent > 1e3 * largest:
             corner = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
             text = f"{corner} given; allowed are coordinates up to {1e3 * largest:g} m"
             raise InputError("", "object.vertices", text)
@@ -151,47 +151,47 @@ class Polygon:
         if not least <= size <= largest:
             text = f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
             raise InputError("", "object.vertices", text)
-        if far > 1e3 * size:
+        if extent > 1e3 * size:
             text = f"allowed are {1e3 * size:.3g} m, 1000 times the polygon's size"
-            raise InputError("", "object.vertices", f"{far:.3g} m from the origin; {text}")
+            raise InputError("", "object.vertices", f"{extent:.3g} m from the origin; {text}")
         edges = np.roll(corners, -1, axis=0) - corners
-        # About a corner: far from the origin, areas would lose their digits.
+        # Relative to a corner: far from the origin, areas would suffer from cancellation.
         local = corners - corners[0]
         cross = cross_product(local, np.roll(local, -1, axis=0))
         area = cross.sum() / 2
         if area <= 0:
             text = f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
             raise InputError("", "object.vertices", f"{text}list its corners anticlockwise")
-        before = np.roll(edges, 1, axis=0)
-        turns = cross_product(before, edges)
-        headings = np.arctan2(turns, np.sum(before * edges, axis=1))
-        reflex = np.flatnonzero(turns <= 1e-9 * area)
+        previous_edges = np.roll(edges, 1, axis=0)
+        corner_crosses = cross_product(previous_edges, edges)
+        exterior_angles = np.arctan2(corner_crosses, np.sum(previous_edges * edges, axis=1))
+        reflex = np.flatnonzero(corner_crosses <= 1e-9 * area)
         if reflex.size:
             text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
             key = f"object.vertices[{reflex[0] + 1}]"
             raise InputError("", key, f"{text}every corner must turn left")
-        shortest, slender, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
+        min_edge, least_ratio, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
         k = int(lengths.argmin())
-        if lengths[k] < shortest * size:
+        if lengths[k] < min_edge * size:
             text = (
-                f"allowed are {shortest * size:.3g} m and more, {shortest:g} of the polygon's size"
+                f"allowed are {min_edge * size:.3g} m and more, {min_edge:g} of the polygon's size"
             )
             text = f"the edge from there has {lengths[k]:.3g} m; {text}"
             raise InputError("", f"object.vertices[{k + 1}]", text)
-        away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
-        width = float(away.max(axis=1).min())
-        if width < slender * size:
-            text = f"allowed are {slender * size:.3g} m and more, {slender:g} of its size"
+        distances = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
+        width = float(distances.max(axis=1).min())
+        if width < least_ratio * size:
+            text = f"allowed are {least_ratio * size:.3g} m and more, {least_ratio:g} of its size"
             raise InputError("", "object.vertices", f"the polygon is {width:.3g} m wide; {text}")
-        if headings.sum() > 2 * np.pi + 1e-6:
+        if exterior_angles.sum() > 2 * np.pi + 1e-6:
             raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
-        middle = ((local + np.roll(local, -1, axis=0)) * cross[:, None]).sum(axis=0) / (6 * area)
-        vertices = local - middle
+        centroid = ((local + np.roll(local, -1, axis=0)) * cross[:, None]).sum(axis=0) / (6 * area)
+        vertices = local - centroid
         after = np.roll(vertices, -1, axis=0)
         squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
         uniform = self.mass * float(cross_product(vertices, after) @ squares) / (12 * float(area))
         object.__setattr__(self, "vertices", frozen(vertices))
-        object.__setattr__(self, "centroid", frozen(corners[0] + middle))
+        object.__setattr__(self, "centroid", frozen(corners[0] + centroid))
         object.__setattr__(self, "inertia", uniform if self.inertia is None else self.inertia)
         object.__setattr__(self, "uniform_inertia", uniform)
         object.__setattr__(self, "size", size)
@@ -209,8 +209,8 @@ class Polygon:
 
     def flush_angle(self, edge: int) -> float:
         """Angle phi in (-pi, pi] at which `edge` lies on the palm below the object [rad]."""
-        run = self.vertices[(edge + 1) % self.n_vertices] - self.vertices[edge]
-        return -math.atan2(run[1], run[0])
+        direction = self.vertices[(edge + 1) % self.n_vertices] - self.vertices[edge]
+        return -math.atan2(direction[1], direction[0])
 
 
 def cross_product(a: Array, b: Array) -> Array:
@@ -219,7 +219,7 @@ def cross_product(a: Array, b: Array) -> Array:
 
 
 TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyration of the object
-HOLDS = ("constant", "linear")  # how torques may be held over control periods
+HOLDS = ("constant", "linear")  # zero- and first-order hold of torques over control periods
 
 
 _LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
@@ -293,8 +293,8 @@ class Friction:
         return self.palm if finger is None else (self.finger1, self.finger2)[finger]
 
 
-class _OfFingers:
-    """A value of both fingers, which has the same name there, after some zeros."""
+class _FingerValues:
+    """Descriptor: an attribute of both fingers as an array, after `zeros` zeros."""
 
     def __init__(self, zeros: int = 0) -> None:
         self._zeros = (0.0,) * zeros
@@ -307,15 +307,15 @@ class _OfFingers:
 
 
 class Scales(NamedTuple):
-    """The scene's own units, which every tolerance is relative to."""
+    """Characteristic units of a scene, to which tolerances are relative."""
 
     length: float  # [m]: radius of gyration of the object
-    mass: float  # [kg]: of the object
-    # [N]: weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
-    # finger can press with at its tip
+    mass: float  # [kg]: mass of the object
+    # [N]: weight of the object; if that is negligible, a hundredth of the tip force of the weaker
+    # finger at its torque limit
     force: float
-    time: float  # [s]: in which the force moves the mass by about the length
-    speed: float  # [m/s]: the others follow from these
+    time: float  # [s]: sqrt(mass length / force)
+    speed: float  # [m/s]: this and the following units are derived
     acceleration: float  # [m/s^2]
     rate: float  # [rad/s]
     inertia: float  # [kg m^2]
@@ -325,11 +325,11 @@ class Scales(NamedTuple):
 
     @staticmethod
     def of(length: float, mass: float, force: float) -> Scales:
-        """The units that follow from three."""
+        """Units derived from those of length [m], mass [kg] and force [N]."""
         time, torque = math.sqrt(mass * length / force), force * length
         motion = time, length / time, force / mass, 1 / time
-        others = mass * length**2, torque, torque / time, torque * time
-        return Scales(length, mass, force, *motion, *others)
+        derived = mass * length**2, torque, torque / time, torque * time
+        return Scales(length, mass, force, *motion, *derived)
 
 
 _PERIOD = relate_time(1e-3, 1e2, "times the scene's time")
@@ -348,7 +348,7 @@ _HOLD_TEXT = (
 )
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that does not move by plan: object, both fingers, friction and gravity.
+    """The mechanical system: object, both fingers, friction, gravity and control period.
 
     InputError if finger 1 is not to the right of finger 2, or a value is not of its type.
     """
@@ -361,19 +361,19 @@ class Scene:
     control_period: float = 0.0
     control_hold: str = HOLDS[0]
 
-    viscous = _OfFingers(3)  # (5,) [N m s]: joint viscous friction B, a force on z' per speed
-    dry = _OfFingers(3)  # (5,) [N m]: joint dry friction D as a force on z
-    torque_limit = _OfFingers()  # (2,) [N m]
-    speed_limit = _OfFingers()  # (2,) [rad/s]: infinite where there is none
-    torque_rate_limit = _OfFingers()  # (2,) [N m/s]: infinite where there is none
-    actuator_lag = _OfFingers()  # (2,) [s]: time constants of the motors
+    viscous = _FingerValues(3)  # (5,) [N m s]: joint viscous friction B, a force on z' per speed
+    dry = _FingerValues(3)  # (5,) [N m]: joint dry friction D as a force on z
+    torque_limit = _FingerValues()  # (2,) [N m]
+    speed_limit = _FingerValues()  # (2,) [rad/s]: infinite where there is none
+    torque_rate_limit = _FingerValues()  # (2,) [N m/s]: infinite where there is none
+    actuator_lag = _FingerValues()  # (2,) [s]: time constants of the motors
 
     def __post_init__(self) -> None:
         check_kinds(Scene.__annotations__, vars(self))
         read_keys(self)
-        # Messages name a finger by its place here, whatever it was made as.
-        named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
-        fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in named)
+        # Messages name a finger by its position here.
+        pairs = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
+        fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in pairs)
         object.__setattr__(self, "fingers", fingers)
         right, left = (np.asarray(finger.base) for finger in self.fingers)
         if right[0] <= left[0]:
@@ -382,40 +382,40 @@ class Scene:
 
     @cached_property
     def scales(self) -> Scales:
-        """Units that fit the scene: tolerances count in them."""
+        """Characteristic units of the scene."""
         mass, weight = self.polygon.mass, self.weight
-        press = min(finger.torque_limit / finger.length for finger in self.fingers)
-        force = weight if weight > 1e-4 * press else press / 100
+        min_force = min(finger.torque_limit / finger.length for finger in self.fingers)
+        force = weight if weight > 1e-4 * min_force else min_force / 100
         return Scales.of(self.polygon.gyration_radius, mass, force)
 
     @cached_property
     def shape(self) -> tuple[object, ...]:
-        """Equal for scenes whose object and links have the same shapes and joints."""
+        """Key of the geometry: equal for scenes with the same polygon, links and joints."""
         joints = [np.asarray(finger.base).tobytes() for finger in self.fingers]
         sizes = [(finger.length, finger.radius) for finger in self.fingers]
         return (self.polygon.vertices.tobytes(), *joints, *sizes)
 
     @cached_property
     def equations(self) -> tuple[object, ...]:
-        """Equal for scenes with the same equations of motion and the same features to touch.
+        """Key of the dynamics: equal for scenes with the same geometry and equations of motion.
 
-        Limits of torques and speeds, and names, are no part of it.
+        Limits of torques and speeds, and names, are not included.
         """
         numbers = (self.mass_diagonal, self.viscous, self.dry, self.applied_force)
-        solid = self.fingers_collide
-        return (self.shape, *(part.tobytes() for part in numbers), self.friction, solid)
+        collide = self.fingers_collide
+        return (self.shape, *(part.tobytes() for part in numbers), self.friction, collide)
 
     @property
     def touching(self) -> float:
-        """Gap below which features count as touching [m]: above rounding, below real clearance."""
+        """Gap below which features count as touching [m]: larger than rounding errors."""
         return TOUCHING * self.scales.length
 
     @cached_property
     def mass_diagonal(self) -> Array:
         """Diagonal of M5, shape (5,): m, m, I, J_1, J_2 [kg, kg m^2]."""
-        body, joints = self.polygon, [finger.inertia for finger in self.fingers]
+        body, joint_inertias = self.polygon, [finger.inertia for finger in self.fingers]
         assert body.inertia is not None
-        return frozen([body.mass, body.mass, body.inertia, *joints])
+        return frozen([body.mass, body.mass, body.inertia, *joint_inertias])
 
     @property
     def weight(self) -> float:
@@ -429,11 +429,11 @@ class Scene:
 
     @property
     def has_slow_motors(self) -> bool:
-        """Whether torques may not step."""
+        """Whether torques are continuous: with rate limits or lags of the motors."""
         return bool(np.isfinite(self.torque_rate_limit).any() or self.actuator_lag.any())
 
     def quicken(self, factor: float) -> Scene:
-        """The scene with torque rate limits and 1 / lags of the motors times a factor."""
+        """The scene with torque rate limits multiplied, and motor lags divided, by a factor."""
 
         def quicken_finger(finger: Finger) -> Finger:
             rate, lag = factor * finger.torque_rate_limit, finger.actuator_lag / factor

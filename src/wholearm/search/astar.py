@@ -1,9 +1,9 @@
 """Best-first search (lazy A*) for routes from a place to a goal, their plans and lower bounds.
 
-Edges along borders are evaluated when their place is expanded; edges through cells, which cost more
-time, wait in the queue with a heuristic lower bound. A greedy heuristic leads to a first plan, a
-more cautious one finds faster routes near the start. Routes are planned in the order of their
-estimated durations; a pattern search finds where their edges leave borders for cells.
+Edges along borders are evaluated when their place is expanded; edges through cells, whose
+evaluation takes longer, are in the queue with a heuristic cost first. A greedy heuristic finds a
+first plan, a more cautious one faster routes near the start. Routes are planned in the order of
+their estimated durations; a pattern search optimizes the places where they leave borders for cells.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ..common.parallel import Task, share
+from ..common.parallel import Task, run_tasks
 from ..common.signals import Reporter, beat
 from ..contacts.elemental import Contact
 from ..geometry.tracing import CostToGo
@@ -30,49 +30,49 @@ from ..planning.result import Plan
 from ..problem.definition import End, Goal, Problem, Until
 from .edge_plans import (
     CoarsePlan,
-    Lost,
     PartPlan,
+    PlanFailure,
     RoutePart,
+    add_time_to_go,
+    find_time_to_go,
     free_landings,
-    list_printed,
-    list_slow,
-    look_ahead,
+    list_slow_phases,
     plan_coarsely,
     plan_part,
     plan_phases,
+    round_phases,
     split_route,
-    time_with,
 )
-from .edges import ROUGHLY, Blocked, Edge, EdgeStep, describe_steps, point_out
+from .edges import SAFETY, BlockedEdge, Edge, EdgeStep, describe_steps, end_at_pose
 from .places import Key, RoadmapPlace, is_at
 from .roadmap import Roadmap
 
 CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
-OFTEN = 2  # expansions of one place, on different routes
-MOST = 4000  # most entries that are taken from the queue
-FINEST = 0.03  # finest step of the place where a border is left, over the border's length
-STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
+MAX_EXPANSIONS = 2  # expansions of one place, on different routes
+MAX_ENTRIES = 4000  # entries that are taken from the queue
+MIN_STEP = 0.03  # smallest step of the place at which a border is left, over the border's length
+STEPS = (4, 2, 1)  # steps of the pattern search, over the smallest one
 GAIN = 0.998  # largest ratio of durations that counts as a gain
-INSIDE = 0.02  # least distance of the place from both ends of the border, over its length
-FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-TRIED = 6  # most routes without a plan, beyond those asked for
-BEYOND = 1.1  # largest estimate of a route over that of the best one
-MEASURED, MORE = 24, 8  # most edges planned until there is a route, and after it
-SETTLED = 240  # most places that are settled to bound routes from below
+END_MARGIN = 0.02  # least distance of the place from both ends of the border, over its length
+MIN_RATIO = 0.7  # empirical least ratio of planned to straight-path durations through cells
+MAX_FAILURES = 6  # number of routes without a plan
+MAX_RATIO = 1.1  # largest estimate of a route over that of the best one
+MAX_EDGES, MORE_EDGES = 24, 8  # edges planned until there is a route, and after it
+MAX_PLACES = 240  # places expanded for the lower bound
 
 
 class Heuristic(NamedTuple):
-    """Estimated cost to go, in the scene's time, and a limit of the search."""
+    """Estimated cost-to-go, in the scene's time, and a limit of the search."""
 
-    turning: float  # per radian that is left to turn
-    leaving: float  # through a cell from a place along a border
-    most: int  # most places that are expanded
+    turn_cost: float  # per radian to the goal
+    release_cost: float  # of leaving a border for a cell
+    max_places: int  # largest number of expanded places
 
 
-EAGER: Heuristic = Heuristic(14.0, 4.0, 130)
-"""As routes through cells take: greedy, leads to a first plan soon."""
-CAREFUL: Heuristic = Heuristic(4.0, 2.5, 200)
-"""Hardly any route takes less: finds routes that start in the wrong direction.
+GREEDY: Heuristic = Heuristic(14.0, 4.0, 130)
+"""Typical costs of routes through cells: a first plan is found soon."""
+CAUTIOUS: Heuristic = Heuristic(4.0, 2.5, 200)
+"""Nearly a lower bound of the costs: finds routes that start in the opposite direction.
 
 Goals 26 and 30 of the corpus have routes that are 11 and 17 % faster behind 50 places, goals 5 and
 7 routes that are 5 and 17 % faster behind 100.
@@ -81,14 +81,14 @@ Goals 26 and 30 of the corpus have routes that are 11 and 17 % faster behind 50 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Edges one after the other."""
+    """A path in the roadmap: consecutive edges."""
 
     start: RoadmapPlace
     edges: tuple[Edge, ...] = ()
 
     @property
     def stop(self) -> RoadmapPlace:
-        """Where it leads."""
+        """The place at its end."""
         return self.edges[-1].stop if self.edges else self.start
 
     def extend(self, edge: Edge) -> Route:
@@ -102,61 +102,61 @@ class Route:
 
     @property
     def in_cells(self) -> bool:
-        """Whether it leads through cells, for which there is no lower bound."""
+        """Whether it leads through cells; then it has no lower bound."""
         return any(edge.in_cell for edge in self.edges)
 
     @property
     def key(self) -> object:
-        """Its formations, and how phases end."""
+        """Formations and transitions of its phases."""
         steps = (step for edge in self.edges for step in edge.steps)
         return tuple((frozenset(step.contacts), step.end) for step in steps)
 
     def has_followed(self, contacts: Sequence[Contact]) -> bool:
-        """Whether contacts are those of the border that it has just followed."""
+        """Whether its last edge is along the border with these contacts."""
         last = self.edges[-1] if self.edges and not self.edges[-1].in_cell else None
         return last is not None and set(last.steps[-1].contacts) == set(contacts)
 
 
 @dataclass(eq=False)
 class RouteSearch:
-    """Routes from a start to a goal."""
+    """Search for routes from a start to a goal."""
 
     roadmap: Roadmap
     start: RoadmapPlace
     goal: Goal
-    # blocked edges, as they are met
-    blocked: list[Blocked] = field(default_factory=list)
+    # blocked edges from expanded places
+    blocked: list[BlockedEdge] = field(default_factory=list)
     # the first route to each expanded place, by its key
     reached: dict[Key, Route] = field(default_factory=dict)
-    found: set[object] = field(default_factory=set)  # keys of routes that have been found
+    route_keys: set[object] = field(default_factory=set)  # keys of routes that were yielded
     limit: float = math.inf  # largest cost of routes [s]
-    sources: Sequence[Route] = ()  # routes to start with, if not from the start itself
+    sources: Sequence[Route] = ()  # initial routes, if not from the start
 
-    def measure(self, place: RoadmapPlace, turning: float = 1.0) -> float:
-        """Heuristic time to turn from a place to the goal [s]; `turning` is that of a radian."""
+    def measure(self, place: RoadmapPlace, turn_cost: float = 1.0) -> float:
+        """Heuristic cost-to-go from a place to the goal [s]; `turn_cost` is per radian."""
         phi, scene = float(place.z[2]), self.roadmap.scene
-        return turning * scene.scales.time * abs(self.goal.find_angle(scene, phi) - phi)
+        return turn_cost * scene.scales.time * abs(self.goal.find_angle(scene, phi) - phi)
 
-    def run(self, heuristic: Heuristic = EAGER) -> Iterator[Route]:
+    def run(self, heuristic: Heuristic = GREEDY) -> Iterator[Route]:
         """Yield new routes, about in the order of their durations."""
         time = self.roadmap.scene.scales.time
-        number, times = count(), Counter[Key]()  # times: expansions of places
-        # Looked at in place of where the route leads: edges from there that are costly to find.
+        number, expansions = count(), Counter[Key]()  # expansions of each place
+        # Edges from the end of a route whose evaluation is postponed; None if it is to be expanded.
         Pending = Callable[[], list[Edge]] | None
         queue = list[tuple[float, int, Route, Pending]]()
 
-        def push(route: Route, pending: Pending = None, more: float = 0.0) -> None:
-            least = route.estimate + self.measure(route.stop, heuristic.turning) + more
-            heapq.heappush(queue, (least, next(number), route, pending))
+        def push(route: Route, pending: Pending = None, extra: float = 0.0) -> None:
+            priority = route.estimate + self.measure(route.stop, heuristic.turn_cost) + extra
+            heapq.heappush(queue, (priority, next(number), route, pending))
 
         for source in self.sources or (Route(self.start),):
             push(source)
-        for _ in range(MOST):
+        for _ in range(MAX_ENTRIES):
             if not queue:
                 return
             beat()
-            least, _, route, pending = heapq.heappop(queue)
-            if least > self.limit or len(times) > heuristic.most:
+            priority, _, route, pending = heapq.heappop(queue)
+            if priority > self.limit or len(expansions) > heuristic.max_places:
                 return
             if pending:
                 edges = pending()
@@ -165,39 +165,39 @@ class RouteSearch:
                 continue
             place = route.stop
             if route.edges and is_at(place, self.goal):
-                if route.key not in self.found:
-                    self.found.add(route.key)
+                if route.key not in self.route_keys:
+                    self.route_keys.add(route.key)
                     yield route
                 continue
             last = route.edges[-1] if route.edges else None
-            if last and last.chain and last.onwards:
-                before = Route(route.start, route.edges[:-1])
-                for edge in self.roadmap.go_on(last.chain, self.goal):
-                    push(before.extend(edge))
-            if times[place.key] >= (1 if place.landed else OFTEN):
+            if last and last.chain and last.continues:
+                shorter = Route(route.start, route.edges[:-1])
+                for edge in self.roadmap.continue_chain(last.chain, self.goal):
+                    push(shorter.extend(edge))
+            if expansions[place.key] >= (1 if place.is_landing else MAX_EXPANSIONS):
                 continue
-            times[place.key] += 1
+            expansions[place.key] += 1
             self.reached.setdefault(place.key, route)
-            for candidate in self.roadmap.set_out(place, self.goal):
+            for candidate in self.roadmap.list_edges(place, self.goal):
                 if route.has_followed(candidate.steps[0].contacts):
                     continue
                 if isinstance(candidate, Edge):
                     push(route.extend(candidate))
-                elif times[place.key] == 1 and candidate not in self.blocked:
+                elif expansions[place.key] == 1 and candidate not in self.blocked:
                     self.blocked.append(candidate)
-            if not place.landed:
-                every = (chain.borders[0] for chain in self.roadmap.follow(place))
-                borders = [b for b in every if not route.has_followed(b.formation.contacts)]
+            if not place.is_landing:
+                followed = (chain.borders[0] for chain in self.roadmap.follow(place))
+                borders = [b for b in followed if not route.has_followed(b.formation.contacts)]
                 for border in borders:
                     release = partial(self.roadmap.release, border, borders)
-                    push(route, release, heuristic.leaving * time)
+                    push(route, release, heuristic.release_cost * time)
                 push(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
 
 
 class RefinedPath(NamedTuple):
-    """Where an edge leaves its border, and the guess of its path through the cell."""
+    """Place at which an edge leaves its border, and the guess of its path through the cell."""
 
-    move: int | None  # shift of the place in finest steps; None: the border is left in motion
+    move: int | None  # shift of the place in smallest steps; None: left without a stop
     straight: bool = True  # guess: straight through the cell, or to the nearest end of the phase
 
 
@@ -205,126 +205,126 @@ def search_release(
     plan: Callable[[RefinedPath, CoarsePlan | None], CoarsePlan | None],
     best: CoarsePlan,
     to_go: CostToGo | None = None,
-    known: Mapping[RefinedPath, CoarsePlan | None] = MappingProxyType({}),
+    cached: Mapping[RefinedPath, CoarsePlan | None] = MappingProxyType({}),
 ) -> list[CoarsePlan]:
-    """Pattern search for the place where an edge leaves a border: the fastest plan, then others.
+    """Pattern search for the place at which an edge leaves a border: the fastest plan, then others.
 
-    By the least time of the edge and of a border that follows where it lands (`to_go`). `plan`
-    plans a path, one without a stop also from a plan with one; `known` are plans made before.
+    The cost is the least time of the edge plus the cost-to-go from its landing (`to_go`). `plan`
+    plans a path; without a stop also from a plan with one. `cached` are plans computed before.
     """
-    least, tried, others = time_with(to_go, best), {RefinedPath(0)}, list[CoarsePlan]()
+    best_time, planned, others = add_time_to_go(to_go, best), {RefinedPath(0)}, list[CoarsePlan]()
 
-    def gains(path: RefinedPath) -> bool:
-        """Plan a path that has not been tried; whether it is the fastest one."""
-        if path in tried:
+    def improves(path: RefinedPath) -> bool:
+        """Plan a path, unless it has been planned; whether it is the fastest one."""
+        if path in planned:
             return False
-        tried.add(path)
-        return accept(known[path] if path in known else plan(path, None))
+        planned.add(path)
+        return accept(cached[path] if path in cached else plan(path, None))
 
-    def accept(made: CoarsePlan | None) -> bool:
-        """Keep a plan, if it is one; whether it is the fastest."""
-        nonlocal best, least
-        if made is None:
+    def accept(candidate: CoarsePlan | None) -> bool:
+        """Store a plan, if there is one; whether it is the fastest."""
+        nonlocal best, best_time
+        if candidate is None:
             return False
-        time = time_with(to_go, made)
-        better = time < GAIN * least
-        others.append(best if better else made)
-        best, least = (made, time) if better else (best, least)
+        time = add_time_to_go(to_go, candidate)
+        better = time < GAIN * best_time
+        others.append(best if better else candidate)
+        best, best_time = (candidate, time) if better else (best, best_time)
         return better
 
     def shift(path: RefinedPath, steps: Sequence[int]) -> RefinedPath:
-        """Shift the place for as long as that gains; first towards the start of the border."""
+        """Shift the place as long as the cost falls; first towards the start of the border."""
         place, sign = path.move or 0, -1
         for step in steps:
             moves = (sign * step, -sign * step)
-            while moved := next((m for m in moves if gains(path._replace(move=place + m))), 0):
-                place, sign = place + moved, 1 if moved > 0 else -1
-                moves = (moved, -moved)
+            while move := next((m for m in moves if improves(path._replace(move=place + m))), 0):
+                place, sign = place + move, 1 if move > 0 else -1
+                moves = (move, -move)
         return path._replace(move=place)
 
-    # In motion the planner chooses the place.
+    # Without a stop the planner chooses the place.
     motion = RefinedPath(None)
-    if not gains(motion):
+    if not improves(motion):
         path = shift(RefinedPath(0), STEPS[:-1])
-        stopped = best
-        # Cases: goals 10, 24, 33, 37, 46 and 51 of the corpus, 3 to 8 % faster; from the finest
-        # place goals 0 and 16.
-        if not accept(plan(motion, stopped)):
+        stop_plan = best
+        # Cases: goals 10, 24, 33, 37, 46 and 51 of the corpus, 3 to 8 % faster; after the smallest
+        # steps goals 0 and 16.
+        if not accept(plan(motion, stop_plan)):
             path = shift(path, STEPS[-1:])
-            if gains(path._replace(straight=False)):
+            if improves(path._replace(straight=False)):
                 shift(path._replace(straight=False), STEPS[1:])
-            if best is not stopped:
+            if best is not stop_plan:
                 accept(plan(motion, best))
     return [best, *others]
 
 
 @dataclass(eq=False)
 class RoutePlanner:
-    """Routes of a search, and plans of those that seem best."""
+    """Routes of a search, and plans of the fastest ones."""
 
     problem: Problem
-    before: Plan | None  # to the goals before
+    previous: Plan | None  # to the previous goals
     search: RouteSearch
     options: PlanOptions
     report: Reporter
-    wanted: int = 1  # number of plans
-    jobs: int = 1  # most processes at the same time
-    spent: float = 0.0  # [s]: estimated least time to the goals before
-    first_only: bool = False  # whether any plan will do: then edges are not refined
-    thorough: bool = False  # whether all guesses are tried for edges through cells
-    found: list[Route] = field(default_factory=list)  # their edges through cells have plans
-    made: list[tuple[Plan, Route]] = field(default_factory=list)
+    n_plans: int = 1  # requested number of plans
+    jobs: int = 1  # largest number of processes
+    time_before: float = 0.0  # [s]: estimated least time to the previous goals
+    first_only: bool = False  # whether the first plan is sufficient: edges are not refined
+    all_guesses: bool = False  # whether all guesses are tried for edges through cells
+    routes: list[Route] = field(default_factory=list)  # their edges through cells have plans
+    plans: list[tuple[Plan, Route]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
-    _measurements: int = 0
-    _bound: tuple[float, BorderBound] | None = None  # up to what it was asked for
-    _lost: list[tuple[Edge, ...]] = field(default_factory=list)
+    _n_planned: int = 0  # edges through cells
+    _bound: tuple[float, BorderBound] | None = None  # limit and lower bound
+    _failed_edges: list[tuple[Edge, ...]] = field(default_factory=list)
 
     @cached_property
     def free(self) -> Problem:
-        """The problem with free torques, with which edges are planned alone."""
+        """The problem with free torques, for plans of single edges."""
         return free_torques(self.problem, self.options)[0]
 
     @property
     def roadmap(self) -> Roadmap:
-        """The roadmap of the search, which keeps plans."""
+        """The roadmap of the search, which stores plans."""
         return self.search.roadmap
 
     def run(self) -> None:
-        """Search and plan until there are as many plans as wanted, or no more routes."""
-        for _ in range(TRIED):
-            failed = len(self.failures)
-            self.look_by(EAGER)
-            self.look_by(CAREFUL)
+        """Search and plan until there are `n_plans` plans, or no more routes."""
+        for _ in range(MAX_FAILURES):
+            n_failures = len(self.failures)
+            self.collect_routes(GREEDY)
+            self.collect_routes(CAUTIOUS)
             self.plan()
-            if len(self.made) >= self.wanted:
+            if len(self.plans) >= self.n_plans:
                 return
-            if len(self.failures) == failed:
-                if self.made or self.thorough or self.first_only or not self._forget_failures():
+            if len(self.failures) == n_failures:
+                if self.plans or self.all_guesses or self.first_only or not self._forget_failures():
                     return
-            # A route without a plan bounds nothing.
+            # The limit came from a route without a plan.
             self.search.limit = math.inf
 
     def _forget_failures(self) -> bool:
-        """Have edges of several phases without a plan planned from all guesses, if there are any.
+        """Discard edges of several phases without a plan; whether there are any.
 
-        Case: query 207, where a release has a plan from the friction homotopy alone.
+        They are planned again from all guesses. Case: query 207 needs the friction homotopy.
         """
-        self.thorough, plans = True, self.roadmap.coarse_plans
-        # For a phase alone, as after a stop, they have been tried.
-        failed = [edge for edge, made in plans.items() if not made]
-        lost = [e for e in failed if len(e.steps) - (e.steps[0].end is End.REST) > 1]
-        for edge in lost:
+        self.all_guesses, plans = True, self.roadmap.coarse_plans
+        # For a single phase, as after a stop, all guesses have been tried.
+        failed = [edge for edge, planned in plans.items() if not planned]
+        edges = [e for e in failed if len(e.steps) - (e.steps[0].end is End.REST) > 1]
+        for edge in edges:
             del plans[edge]
-        self.search.found.clear()
-        return bool(lost)
+        self.search.route_keys.clear()
+        return bool(edges)
 
     def plan(self) -> None:
-        """Plan the routes that are found, the best first, until there are as many as wanted."""
-        for route in sorted(self.found, key=self.estimate):
-            if len(self.made) >= self.wanted or len(self.failures) >= TRIED:
+        """Plan the routes, the best first, until there are `n_plans` plans."""
+        for route in sorted(self.routes, key=self.estimate):
+            if len(self.plans) >= self.n_plans or len(self.failures) >= MAX_FAILURES:
                 return
-            if self._is_lost(route):
-                self.found.remove(route)
+            if self._has_failed(route):
+                self.routes.remove(route)
                 continue
             if not self.first_only:
                 self._refine(route)
@@ -332,75 +332,75 @@ class RoutePlanner:
                 f"planning a route of {sum(len(edge.steps) for edge in route.edges)} phases"
             )
             plan = self._plan(route)
-            if isinstance(plan, str) and self._take_others(route):
+            if isinstance(plan, str) and self._use_others(route):
                 plan = self._plan(route)
-            # An interrupted one is still there, to be planned then.
-            self.found.remove(route)
+            # Removed after planning: an interrupted route is planned again.
+            self.routes.remove(route)
             if isinstance(plan, str):
                 self.failures.append(plan)
-                if isinstance(plan, Lost) and plan.edges:
-                    self._lost.append(plan.edges)
+                if isinstance(plan, PlanFailure) and plan.edges:
+                    self._failed_edges.append(plan.edges)
             else:
-                self.made.append((plan, route))
+                self.plans.append((plan, route))
 
-    def _take_others(self, route: Route) -> bool:
-        """Take the other plans of edges that last least by themselves; whether there are any.
+    def _use_others(self, route: Route) -> bool:
+        """Replace plans of edges by the fastest of their other plans; whether there are any.
 
-        A part of the route of goal 25 of the corpus has no plan otherwise.
+        Case: a part of the route of goal 25 of the corpus has no plan otherwise.
         """
         plans = self.roadmap.coarse_plans
-        several = [edge for edge in route.edges if len(plans.get(edge, ())) > 1]
-        plans.update({edge: plans[edge][1:2] for edge in several})
-        return bool(several)
+        alternatives = [edge for edge in route.edges if len(plans.get(edge, ())) > 1]
+        plans.update({edge: plans[edge][1:2] for edge in alternatives})
+        return bool(alternatives)
 
     def _plan(self, route: Route) -> Plan | str:
         """The plan of the phases that are printed for a route.
 
-        Their ends are those of plans of the route's edges. These are the initial guess, too, if
-        they have the objective of the plan and its torques are not held; otherwise if there is no
-        plan without (query 19, margin).
+        Their ends are those of plans of the route's parts. These plans are also the initial guess
+        if they have the objective of the plan and there is no control period; otherwise only if
+        there is no plan without (query 19, margin).
         """
         problem, options, scene = self.problem, self.options, self.problem.scene
-        # Parts are planned for least time, and not with held torques.
-        alike = options.goal is Objective.TIME and not scene.control_period
-        if not alike:
+        # Parts are planned for least time, and without control period.
+        same_objective = options.goal is Objective.TIME and not scene.control_period
+        if not same_objective:
             options = replace(options, objective=Objective.TIME, duration=None)
         if scene.control_period:
             problem, options = free_torques(problem, options)
-        planned = self._plan_parts(route, problem, options.scale_ranges(problem.ranges))
-        if isinstance(planned, Lost):
-            return planned
-        found = [pair for part in planned for pair in part]
-        before = self.before.problem.phases if self.before else ()
+        parts = self._plan_parts(route, problem, options.scale_ranges(problem.ranges))
+        if isinstance(parts, PlanFailure):
+            return parts
+        pairs = [pair for part in parts for pair in part]
+        previous = self.previous.problem.phases if self.previous else ()
         plan: Plan | str = ""
-        # Without guesses: goal 59 of the corpus, whose plan from them does not hold in its replay.
-        for guesses in (alike, not alike):
-            phases = (*before, *list_printed(scene, found, guesses))
+        # Case without guesses: goal 59 of the corpus, whose plan from them fails in its replay.
+        for guesses in (same_objective, not same_objective):
+            phases = (*previous, *round_phases(scene, pairs, guesses))
             phases = tuple(replace(phase, index=k) for k, phase in enumerate(phases))
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, self.report)
-            lost = plan.phases if isinstance(plan, Lost) else ()
-            if isinstance(plan, Plan) and alike:
-                lost = list_slow(plan, found)
-            if freed := free_landings(printed, lost):
-                other = plan_phases(freed, self.options, self.roadmap.plans, self.report)
-                plans = [made for made in (plan, other) if isinstance(made, Plan)]
-                plan = min(plans, key=lambda made: made.value, default=plan)
+            failed = plan.phases if isinstance(plan, PlanFailure) else ()
+            if isinstance(plan, Plan) and same_objective:
+                failed = list_slow_phases(plan, pairs)
+            if relaxed := free_landings(printed, failed):
+                second = plan_phases(relaxed, self.options, self.roadmap.plans, self.report)
+                plans = [candidate for candidate in (plan, second) if isinstance(candidate, Plan)]
+                plan = min(plans, key=lambda candidate: candidate.value, default=plan)
             if isinstance(plan, Plan):
                 break
-            if isinstance(plan, Lost) and alike:
-                numbers = [k - len(before) for k in plan.phases if k > len(before)]
+            if isinstance(plan, PlanFailure) and same_objective:
+                numbers = [k - len(previous) for k in plan.phases if k > len(previous)]
                 if numbers:
-                    # Without its guess a phase was tried, too. Case: query 62, four of whose routes
-                    # go through phases 18 and 19 of the first one.
-                    plan.edges = self._find_lost(route, numbers)
+                    # A phase is also tried without its guess. Case: query 62, where four routes
+                    # contain phases 18 and 19 of the first one.
+                    plan.edges = self._find_failed(route, numbers)
                     break
         return plan
 
-    def _find_lost(self, route: Route, phases: Sequence[int]) -> tuple[Edge, ...]:
-        """Edges of a route that phases without a plan belong to.
+    def _find_failed(self, route: Route, phases: Sequence[int]) -> tuple[Edge, ...]:
+        """Edges of a route with phases without a plan.
 
-        The one that lands at their start, which may have landed at another place, is before them.
+        Including the edge that lands at their start: another landing may be possible.
         """
         coarse, owners = self.roadmap.coarse_plans, list[int]()
         for k, edge in enumerate(route.edges):
@@ -411,7 +411,7 @@ class RoutePlanner:
 
     def _plan_parts(
         self, route: Route, problem: Problem, options: PlanOptions
-    ) -> list[PartPlan] | Lost:
+    ) -> list[PartPlan] | PlanFailure:
         """Coarse plans of a route's parts, one after the other, or why one has none."""
         coarse = self.roadmap.coarse_plans
         parts = [
@@ -419,123 +419,123 @@ class RoutePlanner:
             for part in split_route(route.edges)
         ]
         self.report(f"planning the route, in parts: {len(parts)}")
-        # Several processes would tell their progress at once.
-        tell, lost = self.report if self.jobs == 1 else Reporter(None), list[Lost]()
+        # Several processes would report at the same time.
+        report, failures = self.report if self.jobs == 1 else Reporter(None), list[PlanFailure]()
 
-        def plan_one(part: RoutePart) -> PartPlan | Lost | None:
+        def plan_one(part: RoutePart) -> PartPlan | PlanFailure | None:
             """Plan a part; None if another one has no plan."""
             begin = replace(problem, start=part[0][0].start.z)
-            made = None if lost else plan_part(begin, part, options, tell)
-            if isinstance(made, Lost):
-                lost.append(made)
-            return made
+            result = None if failures else plan_part(begin, part, options, report)
+            if isinstance(result, PlanFailure):
+                failures.append(result)
+            return result
 
-        known = self.roadmap.part_plans
+        cached = self.roadmap.part_plans
         keys = [(tuple((e, c and c.duration) for e, c in part), repr(options)) for part in parts]
-        # Parts through cells take longest, and the first of them without a plan ends this.
-        along = [not part[0][0].in_cell for part in parts]
-        order = sorted(range(len(parts)), key=along.__getitem__)
-        wanted = takewhile(lambda k: not isinstance(known.get(keys[k]), Lost), order)
-        new = [k for k in wanted if keys[k] not in known]
+        # Parts through cells, which take longest, come first; the first failure ends the loop.
+        on_borders = [not part[0][0].in_cell for part in parts]
+        order = sorted(range(len(parts)), key=on_borders.__getitem__)
+        pending = takewhile(lambda k: not isinstance(cached.get(keys[k]), PlanFailure), order)
+        new = [k for k in pending if keys[k] not in cached]
         tasks: list[Task[Any]] = [partial(plan_one, parts[k]) for k in new]
-        enough = BEYOND * self.estimate(route)
-        if self.jobs > 1 and not self.before and not self._bound:
-            # A bound up to more than the plan will take, computed beside it.
-            tasks.append(partial(bound_borders, self.search, enough))
-        results = share(tasks, self.jobs)
+        limit = MAX_RATIO * self.estimate(route)
+        if self.jobs > 1 and not self.previous and not self._bound:
+            # The lower bound is computed in parallel, up to more than the duration of the plan.
+            tasks.append(partial(bound_borders, self.search, limit))
+        results = run_tasks(tasks, self.jobs)
         for bound in results[len(new) :]:
-            self._bound = enough, bound
-        known.update({keys[k]: made for k, made in zip(new, results, strict=False) if made})
+            self._bound = limit, bound
+        cached.update({keys[k]: result for k, result in zip(new, results, strict=False) if result})
         for k in order:
-            if isinstance(made := known.get(keys[k]), Lost):
-                passed = sum(len((plan or edge).steps) for part in parts[:k] for edge, plan in part)
-                made.edges = self._find_lost(route, [passed + number for number in made.phases])
-                return made
-        # None is lost, and so all are planned.
-        return [cast(PartPlan, known[key]) for key in keys]
+            if isinstance(result := cached.get(keys[k]), PlanFailure):
+                offset = sum(len((plan or edge).steps) for part in parts[:k] for edge, plan in part)
+                result.edges = self._find_failed(route, [offset + n for n in result.phases])
+                return result
+        # Without failure all parts are planned.
+        return [cast(PartPlan, cached[key]) for key in keys]
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
-        """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
-        wanted = duration if in_cells else math.inf
-        enough, bound = self._bound or (0.0, None)
-        if bound is None or min(enough, wanted) <= bound.value < wanted:
-            return bound_borders(self.search, wanted)
-        return bound.up_to(wanted)
+        """Lower bound of all routes along borders; for a plan `in_cells` up to its `duration`."""
+        limit = duration if in_cells else math.inf
+        last_limit, bound = self._bound or (0.0, None)
+        if bound is None or min(last_limit, limit) <= bound.value < limit:
+            return bound_borders(self.search, limit)
+        return bound.up_to(limit)
 
-    def look_by(self, heuristic: Heuristic) -> None:
-        """Collect routes by a heuristic, while a better one is possible."""
-        looked, most = 0, self._measurements + MEASURED
+    def collect_routes(self, heuristic: Heuristic) -> None:
+        """Collect routes by a heuristic search, while a better one is possible."""
+        n_routes, max_edges = 0, self._n_planned + MAX_EDGES
         for route in self.search.run(heuristic):
-            if len(self.found) >= self.wanted and self.estimate(route) > self._best:
+            if len(self.routes) >= self.n_plans and self.estimate(route) > self._best:
                 return
-            if looked > self.wanted + TRIED or self._measurements >= most:
+            if n_routes > self.n_plans + MAX_FAILURES or self._n_planned >= max_edges:
                 return
-            if self._measure(route):
-                looked += 1
-                self.found.append(route)
-                if len(self.found) >= self.wanted:
-                    self.search.limit = BEYOND * self._best
-                    most = min(most, self._measurements + MORE)
+            if self._plan_cells(route):
+                n_routes += 1
+                self.routes.append(route)
+                if len(self.routes) >= self.n_plans:
+                    self.search.limit = MAX_RATIO * self._best
+                    max_edges = min(max_edges, self._n_planned + MORE_EDGES)
 
     @property
     def _best(self) -> float:
-        """About the least time of a route that is found [s]."""
-        return min((self.estimate(route) for route in self.found), default=float("inf"))
+        """Least estimated time of the routes [s]."""
+        return min((self.estimate(route) for route in self.routes), default=float("inf"))
 
-    def _measure(self, route: Route) -> bool:
-        """Plan the edges of a route that lead through cells; whether all have a plan."""
-        if self._is_lost(route):
+    def _plan_cells(self, route: Route) -> bool:
+        """Plan the edges of a route through cells; whether all have a plan."""
+        if self._has_failed(route):
             return False
         plans = self.roadmap.coarse_plans
         in_cells = [edge for edge in route.edges if edge.in_cell]
         new = [edge for edge in in_cells if edge not in plans]
-        self._measurements += len(new)
+        self._n_planned += len(new)
         if new:
             self.report("; ".join(f"planning {describe_steps(edge.steps)}" for edge in new))
-        plan = partial(plan_coarsely, self.free, options=self.options, thorough=self.thorough)
+        plan = partial(plan_coarsely, self.free, options=self.options, all_guesses=self.all_guesses)
         tasks = [partial(plan, edge, edge.steps) for edge in new]
-        for edge, coarse in zip(new, share(tasks, self.jobs), strict=True):
+        for edge, coarse in zip(new, run_tasks(tasks, self.jobs), strict=True):
             plans[edge] = [coarse] if coarse else []
         return all(plans[edge] for edge in in_cells)
 
     def _refine(self, route: Route) -> None:
         """Optimize the places where a route leaves borders for cells."""
         roadmap, searches = self.roadmap, dict[Edge, partial[list[CoarsePlan]]]()
-        for edge, after in pairwise((*route.edges, None)):
-            if edge is None or edge.left is None or edge in roadmap.refined:
+        for edge, later in pairwise((*route.edges, None)):
+            if edge is None or edge.curve is None or edge in roadmap.refined:
                 continue
             self.report(f"planning {describe_steps(edge.steps)} in other ways")
-            single = after and not after.in_cell and len(after.steps) == 1
-            to_go = look_ahead(self.problem, after, edge.stop) if after and single else None
+            single = later and not later.in_cell and len(later.steps) == 1
+            to_go = find_time_to_go(self.problem, later, edge.stop) if later and single else None
             (plan,) = roadmap.coarse_plans[edge]
             searches[edge] = partial(search_release, partial(self._release, edge), plan, to_go)
         roadmap.refined.update(searches)
         if self.jobs > 1 and len(searches) == 1:
             ((edge, search),) = searches.items()
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-            made = share([partial(search.args[0], path, None) for path in paths], self.jobs)
-            searches[edge] = partial(search, known=dict(zip(paths, made, strict=True)))
-        results = share(list(searches.values()), self.jobs)
+            plans = run_tasks([partial(search.args[0], path, None) for path in paths], self.jobs)
+            searches[edge] = partial(search, cached=dict(zip(paths, plans, strict=True)))
+        results = run_tasks(list(searches.values()), self.jobs)
         for edge, (best, *others) in zip(searches, results, strict=True):
             roadmap.coarse_plans[edge] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
     def _release(
-        self, edge: Edge, path: RefinedPath, stopped: CoarsePlan | None
+        self, edge: Edge, path: RefinedPath, stop_plan: CoarsePlan | None
     ) -> CoarsePlan | None:
-        """Plan an edge that leaves its border at another place; or in motion, from a plan if any.
+        """Plan an edge that leaves its border at another place, or without a stop.
 
-        That plan stops where it leaves the border.
+        `stop_plan`, which stops on the border, is a guess of the latter.
         """
         first, *rest = edge.steps
         step = EdgeStep(first.contacts, Until(), End.SMOOTH)
         if path.move is not None:
-            place = edge.share + FINEST * path.move
-            if not INSIDE < place < 1 - INSIDE:
+            place = edge.fraction + MIN_STEP * path.move
+            if not END_MARGIN < place < 1 - END_MARGIN:
                 return None
-            assert edge.left is not None
-            z = edge.left.evaluate(np.array([place * edge.left.length])).z[0]
-            step = first._replace(until=point_out(first.contacts, z))
-        # In motion the first guess has no plan in goal 48 of the corpus.
+            assert edge.curve is not None
+            z = edge.curve.evaluate(np.array([place * edge.curve.length])).z[0]
+            step = first._replace(until=end_at_pose(first.contacts, z))
+        # Without a stop all guesses: goal 48 of the corpus has no plan from the first one.
         return plan_coarsely(
             self.free,
             edge,
@@ -543,74 +543,74 @@ class RoutePlanner:
             self.options,
             straight=path.straight,
             first_only=path.move is not None,
-            stopped=stopped,
+            stop_plan=stop_plan,
         )
 
-    def _is_lost(self, route: Route) -> bool:
-        """Whether a route contains edges that had no plan on another one."""
+    def _has_failed(self, route: Route) -> bool:
+        """Whether a route contains edges that have no plan on another route."""
         return any(
-            route.edges[k : k + len(lost)] == lost
-            for lost in self._lost
+            route.edges[k : k + len(failed)] == failed
+            for failed in self._failed_edges
             for k in range(len(route.edges))
         )
 
     def estimate(self, route: Route) -> float:
-        """About the least time that a plan along all routes may take [s]."""
-        total = self.spent
+        """Estimated least time of a plan along the routes to all goals [s]."""
+        total = self.time_before
         for edge in route.edges:
             if plans := self.roadmap.coarse_plans.get(edge):
                 total += plans[0].duration
             else:
-                total += FASTER * edge.estimate if edge.in_cell else edge.estimate
+                total += MIN_RATIO * edge.estimate if edge.in_cell else edge.estimate
         return total
 
 
 class BorderBound(NamedTuple):
     """A lower bound of the duration of routes along borders.
 
-    They stop where borders meet, or pass through by a plastic impact that is possible.
+    At junctions of borders they stop, pass smoothly, or have a possible plastic impact.
     """
 
     value: float  # [s]: no such route takes less
-    # whether it is that of a route, or larger than what was asked for; otherwise more would have
-    # had to be looked at
+    # whether the search for it ended: at the bound of a route, or at the limit of the search; not
+    # at `MAX_PLACES`
     complete: bool
 
-    def up_to(self, enough: float) -> BorderBound:
-        """The bound, at most `enough` [s]."""
-        return self if self.value < enough else BorderBound(enough, True)
+    def up_to(self, limit: float) -> BorderBound:
+        """The bound, at most `limit` [s]."""
+        return self if self.value < limit else BorderBound(limit, True)
 
 
-def bound_borders(search: RouteSearch, enough: float) -> BorderBound:
-    """Bound every route along borders from below, up to `enough` [s].
+def bound_borders(search: RouteSearch, limit: float) -> BorderBound:
+    """Lower bound of all routes along borders, up to `limit` [s].
 
-    Dijkstra's algorithm with coarse bounds of edges; those of the shortest route are refined until
-    all of its edges are.
+    Dijkstra's algorithm with coarse bounds of edges. Bounds of edges on the shortest route are
+    refined, until all of them are.
     """
     refined, edges_from = set[Edge](), dict[Key, list[Edge]]()
     while True:
         order, settled, edges = count(), set[Key](), tuple[Edge, ...]()
-        bound = BorderBound(enough, True)
+        bound = BorderBound(limit, True)
         queue = [(0.0, next(order), search.start, edges)]
         while queue:
             beat()
             cost, _, place, route = heapq.heappop(queue)
-            if cost >= enough:
+            if cost >= limit:
                 break
             if is_at(place, search.goal):
                 bound, edges = BorderBound(cost, True), route
                 break
             if place.key in settled:
                 continue
-            if len(settled) >= SETTLED:
+            if len(settled) >= MAX_PLACES:
                 bound = BorderBound(cost, False)
                 break
             settled.add(place.key)
             if place.key not in edges_from:
-                edges_from[place.key] = list(search.roadmap.list_along(place, search.goal))
+                edges_from[place.key] = list(search.roadmap.collect_edges(place, search.goal))
             for edge in edges_from[place.key]:
-                least = edge.fine_bound if edge in refined else ROUGHLY * edge.bound
-                heapq.heappush(queue, (cost + least, next(order), edge.stop, (*route, edge)))
+                edge_bound = edge.fine_bound if edge in refined else SAFETY * edge.bound
+                heapq.heappush(queue, (cost + edge_bound, next(order), edge.stop, (*route, edge)))
         if refined.issuperset(edges):
             return bound
         refined.update(edges)

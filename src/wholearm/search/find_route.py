@@ -1,6 +1,6 @@
-"""Plans to goals: search over the roadmap, planning of the routes found, and lower bounds.
+"""Plans to goals: search over the roadmap, planning of routes, and lower bounds.
 
-Where no route exists, single numbers of the problem are varied until one does.
+If no route exists, single parameters of the problem are varied to find a change that opens one.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from ..common.document import Document, Result, Table
 from ..common.errors import Change, InfeasibleError, InputError, SolverError, name_source
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
-from ..common.signals import OutOfTime, Reporter, interruptible, limited, yielding
+from ..common.signals import OutOfTime, Reporter, interrupt_at_beat, interruptible, limit_time
 from ..geometry.tracing import HELD
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from ..problem.read import name_goal
-from ..problem.table import PRINTED, describe_phase, describe_scene, write_toml
-from .astar import CAREFUL, BorderBound, Route, RoutePlanner, RouteSearch
+from ..problem.table import DIGITS, describe_phase, describe_scene, write_toml
+from .astar import CAUTIOUS, BorderBound, Route, RoutePlanner, RouteSearch
 from .cuts import describe_block, describe_border, explain_block, find_opening
 from .edge_plans import coarsen
-from .edges import Blocked
+from .edges import BlockedEdge
 from .places import is_at, make_place, require_reach
-from .roadmap import LONGEST, Roadmap
+from .roadmap import MAX_BORDERS, Roadmap
 
-LARGEST = 200_000_000  # Most bytes of a stored roadmap
-ROADMAPS = 4  # scenes whose roadmaps are kept in memory
+MAX_BYTES = 200_000_000  # largest size of a stored roadmap [byte]
+ROADMAPS = 4  # number of roadmaps kept in memory
 _roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
 
@@ -65,73 +65,73 @@ def find_route(
     problem : Problem
         With goals.
     objective : {"time", "effort", "margin"}
-        Routes are looked for by their least time; plans along them are of this objective.
+        Objective of the plans; the search for routes minimizes time.
     alternatives : int
-        How many routes of other formations are planned beside the best one.
+        Number of further routes, with other formations, that are planned.
     progress : callable, optional
-        Told in a few words what is being done.
+        Called with short messages about the current step.
     cache : path-like, optional
-        Folder where what is known of the scene is kept, for other processes. Its files are pickles:
-        it has to be one that nobody else writes to.
+        Folder in which the roadmap of the scene is stored, for other processes. Its files are
+        pickles: nobody else may have write access.
     jobs : int
-        Most processes at the same time; others than this one are forked. What is found does not
-        depend on it.
+        Largest number of processes; child processes are forked. The result does not depend on it.
     time_limit : float, optional, [s]
-        Longest time that the search may take; then the best route so far is returned.
+        Time limit of the search; at the limit the best route so far is returned.
     hurry : callable, optional
-        With it an interrupt ends the search alone: the best route so far is returned, or planned,
-        which it is called before. Without it KeyboardInterrupt is raised.
+        With it an interrupt ends only the search: the best route so far is returned, or planned if
+        it has no plan; `hurry` is called before. Without it KeyboardInterrupt is raised.
     **options
-        As `wholearm.solve` takes them.
+        Options of `wholearm.solve`.
 
     Raises
     ------
     InputError       if the problem has no goals, one is out of reach, or an option out of its range
-    InfeasibleError  if nothing leads to a goal; names what blocks the way
-    SolverError      if the time is over before there is a plan; names what is missing
+    InfeasibleError  if no route leads to a goal; names the blocked borders
+    SolverError      if there is no plan at the time limit; names the missing part
     """
-    for name, number, least in (("jobs", jobs, 1), ("alternatives", alternatives, 0)):
-        if not isinstance(number, int) or number < least:
-            raise InputError("", name, f"{number!r} given; allowed is an integer from {least} up")
-    plan_options = PlanOptions(objective=objective, **options)
-    with interruptible(), limited(time_limit):
+    for name, number, low in (("jobs", jobs, 1), ("alternatives", alternatives, 0)):
+        if not isinstance(number, int) or number < low:
+            raise InputError("", name, f"{number!r} given; allowed is an integer from {low} up")
+    settings = PlanOptions(objective=objective, **options)
+    with interruptible(), limit_time(time_limit):
         report = Reporter(progress)
         if not problem.goals:
             reason = "is missing; allowed is flush or phi_deg, and x"
             raise InputError(problem.source, "goal", reason)
         if cache is not None:
             make_folder(str(cache), "cache")
-        key, roadmap = get_roadmap(problem, plan_options, cache)
-        before, start, spent = list[Answer](), problem.start, 0.0
-        for index, given_goal in enumerate(problem.goals):
-            goal = given_goal.with_edge(problem.scene, HELD)
+        key, roadmap = get_roadmap(problem, settings, cache)
+        answers, start, elapsed = list[Answer](), problem.start, 0.0
+        for index, entry in enumerate(problem.goals):
+            goal = entry.with_edge(problem.scene, HELD)
             place = make_place(problem.scene, start)
             if is_at(place, goal):
                 reason = f"{goal} holds already where the motion starts"
                 raise InputError(problem.source, name_goal(problem.goals, index), reason)
             with name_source(problem.source, f"{name_goal(problem.goals, index)}."):
                 require_reach(problem.scene, goal, float(start[2]))
-            search, last = RouteSearch(roadmap, place, goal), before[-1].plan if before else None
-            wanted = 1 + (alternatives if index + 1 == len(problem.goals) else 0)
-            given = problem, last, search, plan_options, report, wanted, jobs, spent
-            planner = RoutePlanner(*given)
-            before.append(_plan_to_goal(planner, hurry))
-            start, spent = before[-1].route.stop.z, planner.estimate(before[-1].route)
+            search, prior = RouteSearch(roadmap, place, goal), answers[-1].plan if answers else None
+            n_plans = 1 + (alternatives if index + 1 == len(problem.goals) else 0)
+            planner = RoutePlanner(
+                problem, prior, search, settings, report, n_plans, jobs, time_before=elapsed
+            )
+            answers.append(_plan_to_goal(planner, hurry))
+            start, elapsed = answers[-1].route.stop.z, planner.estimate(answers[-1].route)
         if cache is not None:
             try:
                 store_roadmap(Path(cache), key, roadmap)
             except InputError as error:
-                # The result counts, with or without a copy for later searches.
+                # The result is valid without the stored roadmap.
                 warnings.warn(str(error), stacklevel=2)
-        return before[-1]
+        return answers[-1]
 
 
 def get_roadmap(
     problem: Problem, options: PlanOptions, cache: str | Path | None
 ) -> tuple[str, Roadmap]:
-    """The roadmap of a problem's scene, from memory, from a folder, or a new one.
+    """Key and roadmap of a problem's scene: from memory, from a folder, or a new one.
 
-    And everything that it depends on, as JSON. It keeps coarse plans, which depend on options.
+    The key is JSON of all that the roadmap depends on: scene, epsilon, options of coarse plans.
     """
     numbers = problem.epsilon, repr(coarsen(options))
     key = json.dumps(describe_scene(problem.scene) | {"": numbers}, sort_keys=True)
@@ -151,55 +151,55 @@ def forget_roadmaps() -> None:
 
 def _plan_to_goal(planner: RoutePlanner, hurry: Callable[[], None] | None) -> Answer:
     """Plan routes to one goal, with a lower bound of the best one."""
-    start, complete, search, made = time.process_time(), False, planner.search, planner.made
+    start, complete, search, plans = time.process_time(), False, planner.search, planner.plans
     try:
-        with yielding():
+        with interrupt_at_beat():
             planner.report("looking for routes")
             planner.run()
         complete = True
     except OutOfTime:
-        if not made:
+        if not plans:
             text = f"the time limit is over, and there is no plan yet: {len(search.reached)} places"
             text += " looked at"
-            if planner.found:
-                best = min(planner.found, key=planner.estimate)
+            if planner.routes:
+                best = min(planner.routes, key=planner.estimate)
                 count = sum(len(edge.steps) for edge in best.edges)
                 duration = planner.estimate(best)
                 text += f", a route of {count} phases found, of about {duration:.3g} s"
             raise SolverError(f"{text}; what it was at: {planner.report.last}") from None
     except KeyboardInterrupt:
-        if hurry is None or not (made or planner.found):
+        if hurry is None or not (plans or planner.routes):
             raise
-        if not made:
+        if not plans:
             hurry()
-            planner.first_only, planner.wanted = True, 1
+            planner.first_only, planner.n_plans = True, 1
             planner.plan()
     except np.linalg.LinAlgError:
-        # Dependent contacts at a place that the search has reached.
-        if not made:
-            planner.wanted = 1
+        # The contacts at a reached place are linearly dependent.
+        if not plans:
+            planner.n_plans = 1
             planner.plan()
-    if not made:
+    if not plans:
         raise _explain(planner, time.process_time() - start, hurry)
     sign = -1 if planner.options.goal is Objective.MARGIN else 1
-    made.sort(key=lambda pair: sign * pair[0].value)
-    plan, route = made[0]
+    plans.sort(key=lambda pair: sign * pair[0].value)
+    plan, route = plans[0]
     bound = None
-    if complete and not planner.before:
+    if complete and not planner.previous:
         complete = False
-        with _ending(hurry):
+        with _limit_interrupt(hurry):
             bound = planner.bound(plan.duration, route.in_cells)
             complete = True
-    others = tuple(Alternative(other) for other, _ in made[1 : planner.wanted])
+    others = tuple(Alternative(other) for other, _ in plans[1 : planner.n_plans])
     failures, blocked = tuple(planner.failures), tuple(search.blocked)
     return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
 
 
 @contextmanager
-def _ending(hurry: Callable[[], None] | None) -> Iterator[None]:
-    """Have an interrupt end what is done here alone, as far as it may, or the end of the time."""
+def _limit_interrupt(hurry: Callable[[], None] | None) -> Iterator[None]:
+    """Context that a time limit or (with `hurry`) an interrupt ends, without raising it."""
     try:
-        with yielding():
+        with interrupt_at_beat():
             yield
     except KeyboardInterrupt as error:
         if hurry is None and not isinstance(error, OutOfTime):
@@ -209,9 +209,9 @@ def _ending(hurry: Callable[[], None] | None) -> Iterator[None]:
 def _explain(
     planner: RoutePlanner, seconds: float, hurry: Callable[[], None] | None
 ) -> InfeasibleError:
-    """Why nothing leads to a goal, after so many seconds of search [s]."""
+    """Error of a goal without a route, after a search of `seconds` of processor time."""
     search, opening, changes, text = planner.search, "", tuple[Change, ...](), ""
-    with _ending(hurry):
+    with _limit_interrupt(hurry):
         opening, changes = find_opening(planner, seconds)
         explain = partial(explain_block, planner.problem, planner.options)
         text = describe_block(search, planner.failures, opening, explain)
@@ -220,9 +220,9 @@ def _explain(
 
 
 def load_roadmap(folder: Path, key: str) -> Roadmap | None:
-    """The stored roadmap of a scene; None where there is none, or the file is damaged.
+    """The stored roadmap of a scene; None if there is none, or the file is damaged.
 
-    Files are pickles, which can execute code: a folder that others write to is not safe.
+    Files are pickles, which can execute code: a folder with write access for others is not safe.
     """
     try:
         content = _name_file(folder, key).read_bytes()
@@ -234,24 +234,24 @@ def load_roadmap(folder: Path, key: str) -> Roadmap | None:
 
 
 def store_roadmap(folder: Path, key: str, roadmap: Roadmap) -> None:
-    """Write the roadmap of a scene in place of the one before."""
+    """Write the roadmap of a scene, in place of a stored one."""
     body = pickle.dumps(roadmap, pickle.HIGHEST_PROTOCOL)
-    if len(body) <= LARGEST:
+    if len(body) <= MAX_BYTES:
         digest = hashlib.sha256(body).digest()
         write_whole(_name_file(folder, key), lambda stream: stream.write(digest + body))
 
 
 def _name_file(folder: Path, key: str) -> Path:
-    """The file of a scene: another one for other versions, and for other code of this one."""
+    """Path of the file of a scene; it depends on versions and on the code of the package."""
     versions = f"{digest_package()} {ca.__version__} {np.__version__} {sys.version}"
     return folder / f"{hashlib.sha256(f'{versions} {key}'.encode()).hexdigest()[:32]}.chart"
 
 
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
-    f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
+    f"more than {MAX_BORDERS} borders passed without a stop, impacts out of or into cells, motions "
     "through cells that no straight way from rest shows to be possible, and what is further than "
-    f"{CAREFUL.most} places; phases may be as many as it takes"
+    f"{CAUTIOUS.max_places} places; phases may be as many as it takes"
 )
 
 
@@ -296,16 +296,16 @@ class Alternative(Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Answer(Alternative):
-    """The best route that was found, with its plan."""
+    """The best route to the goals, with its plan."""
 
     route: Route  # to the last goal
     # lower bound of routes along borders; None with several goals or an interrupted search
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]
     failures: tuple[str, ...]  # why routes have no plan
-    blocked: tuple[Blocked, ...]  # borders that no motion can follow
-    settled: int  # places that were looked at
-    complete: bool  # whether the search ended by itself
+    blocked: tuple[BlockedEdge, ...]  # borders that no motion can follow
+    settled: int  # number of expanded places
+    complete: bool  # whether the search ended without interrupt and time limit
 
     @property
     def gap(self) -> float | None:
@@ -319,7 +319,7 @@ class Answer(Alternative):
         return max(0.0, self.plan.duration / self.bound.value - 1.0)
 
     def to_text(self) -> str:
-        """The route as ``[[phases]]``, and how good it is, as comments."""
+        """The route as ``[[phases]]``, with value, bound and statistics as comments."""
         lines = [f"# {line}" for line in self.describe()]
         lines += ["", format_phases(self.problem).rstrip()]
         for number, other in enumerate(self.alternatives, start=2):
@@ -338,15 +338,15 @@ class Answer(Alternative):
         if self.bound is not None:
             text = "no route along borders, with stops or impacts, "
             # The bound is at most the duration of the plan.
-            none = self.route.in_cells and self.bound.value >= self.plan.duration
-            text += "is faster" if none else f"takes less than {self.bound.value:.6f} s"
+            exceeded = self.route.in_cells and self.bound.value >= self.plan.duration
+            text += "is faster" if exceeded else f"takes less than {self.bound.value:.6f} s"
             text += "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
-            ended = "" if self.bound.complete else " (the search for such routes ended early)"
-            lines.append(text + ended)
+            ending = "" if self.bound.complete else " (the search for such routes ended early)"
+            lines.append(text + ending)
         if self.route.in_cells:
             lines.append("this one leads through cells, where nothing bounds times from below")
-        tried = f"places looked at: {self.settled}, ways blocked: {len(self.blocked)}"
-        lines.append(f"{tried}, routes without a plan: {len(self.failures)}")
+        counts = f"places looked at: {self.settled}, ways blocked: {len(self.blocked)}"
+        lines.append(f"{counts}, routes without a plan: {len(self.failures)}")
         return [*lines, NOT_CONSIDERED]
 
     @property
@@ -368,4 +368,4 @@ class Answer(Alternative):
 
 def format_phases(problem: Problem) -> str:
     """The phases of a problem as `[[phases]]` of a problem file."""
-    return write_toml({"phases": [describe_phase(phase, PRINTED) for phase in problem.phases]})[1:]
+    return write_toml({"phases": [describe_phase(phase, DIGITS) for phase in problem.phases]})[1:]

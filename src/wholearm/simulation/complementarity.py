@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array, Flags, Independent, Numbers, find_root
+from ..common.arrays import Array, Flags, IndependentRows, Numbers, find_root
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, Outcome, OutcomeKind, describe_change
 from .modes import find_breach
@@ -311,7 +311,7 @@ class ClosedContacts:
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
         order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
-        adds, root = Independent(DEPENDENT).add, np.sqrt(system.mass)
+        adds, root = IndependentRows(DEPENDENT).add, np.sqrt(system.mass)
         A, A_t = at.A / root, at.A_t / root
         kept = {k for k in order if presses[k] and adds(A[k])}
         count, held, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()

@@ -46,11 +46,10 @@ from ..common.arrays import Array, Flags, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import close_all, find_freedoms, move_least
+from ..mechanics.dynamics import close_all, solve_min_norm
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
-from ..scene.model import Scene
 from .system import ROUNDING_FORCE, STILL, ContactRows, Modes, build_system
 
 _JOINTS = np.eye(5)[3:]  # rows that give the rates of the joints from z'
@@ -103,13 +102,6 @@ class Mode:
     def declares(self, holder: int) -> bool:
         """Whether the phase asks for what the `holder`-th force after c_n holds."""
         return self.holders[holder][0] in self.formation.rolling_rows
-
-    @cached_property
-    def force_limit_units(self) -> Array:
-        """The scene's units of `Response.force_limits`, shape (n_c + 2 K,) [N, N m]."""
-        scales, count = self.formation.scene.scales, self.formation.n_contacts
-        held = [scales.force if rows[0] < count else scales.torque for rows in self.holders]
-        return np.array([scales.force] * count + held + held)
 
 
 def find_mode(formation: Formation, signs: Array) -> Mode:
@@ -164,18 +156,21 @@ class Response(NamedTuple):
 
     @property
     def force_limits(self) -> Array:
-        """What has to be positive for everything to hold, (n_c + 2 K, 3) [N, N m].
+        """What has to be positive for everything to hold, scaled, (n_c + 2 K, 3).
 
         Every c_n, then both sides of the cones of the K that are held (see `EventRows.cone`).
         """
         formation, count = self.mode.formation, self.mode.formation.n_contacts
-        forces, bounds = self.c[count:], np.zeros((len(self.mode.holders), 3))
+        scales, (c_n, forces) = formation.scene.scales, np.split(self.c, [count])
+        bounds, units = np.zeros(forces.shape), np.full((len(forces), 1), scales.force)
         for k, rows in enumerate(self.mode.holders):
             if rows[0] < count:
-                bounds[k] = formation.friction[list(rows)] @ self.c[list(rows)]
+                bounds[k] = formation.friction[list(rows)] @ c_n[list(rows)]
             else:
                 bounds[k, 0] = formation.scene.dry[3 + rows[0] - count]
-        return np.vstack([self.c[:count], bounds - forces, bounds + forces])
+                units[k] = scales.torque
+        cones = (bounds - forces) / units, (bounds + forces) / units
+        return np.vstack([c_n / scales.force, *cones])
 
     @property
     def c_t(self) -> Array:
@@ -245,10 +240,10 @@ class Collapse(NamedTuple):
 
 
 class StartMode(NamedTuple):
-    """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
+    """Start mode; quantities at rest are rows @ (1, tau_1, tau_2), in the scene's units."""
 
     response: Response
-    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`mechanics.limits`)
+    # (n_c + 2 R, 3): what has to be positive for the contacts to hold, H c (`mechanics.limits`)
     force_limits: Array
     # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
     slips: Array
@@ -256,21 +251,21 @@ class StartMode(NamedTuple):
     # friction that holds what has no sign, and accelerations that open closed gaps
     margins: Array
     heading: Array | None  # (5,): with one freedom, the direction
-    statics: Statics
+    rest: Rest
 
     def drive(self, tau: Array) -> float:
         """Acceleration in the metric M5."""
-        mass = self.statics.scene.mass_diagonal
+        mass = self.rest.scene.mass_diagonal
         return float(np.sqrt(mass @ (self.response.acceleration @ [1.0, *tau]) ** 2))
 
     def slides(self, tau: Array) -> bool:
         """Whether the formation accelerates in this mode if every contact can press or pull."""
-        load, least = np.array([1.0, *tau]), _measure_drive(self.statics.scene)
+        load = np.array([1.0, *tau])
         return (
             self.response.ratio > 0
-            and self.drive(tau) > least
+            and self.drive(tau) > STILL * self.rest.unit
             and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
-            and self.statics.opens(self.response.acceleration @ load)
+            and self.rest.opens(self.response.acceleration @ load)
         )
 
     def moves(self, tau: Array) -> bool:
@@ -283,23 +278,33 @@ class StartMode(NamedTuple):
         return StartDeparture(x, heading, self.response.mode)
 
 
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """A formation at rest at a configuration."""
+class Rest(Statics):
+    """Statics with the modes in which a motion starts.
 
-    formation: Formation
-    z: Array  # (5,)
-    statics: Statics  # of the formation
-    heading: Array | None  # (5,): with one freedom the direction, of length one in the metric M5
+    Raises a `SimulationError` for dependent contacts or no freedom.
+    """
+
+    def __init__(self, formation: Formation, z: Array) -> None:
+        super().__init__(formation, z)
+        freedoms, scales = self.freedoms.shape[1], self.scene.scales
+        if freedoms > 5 - formation.n_constraints or not freedoms:
+            raise SimulationError(
+                f"{' '.join(formation.names)} leaves {freedoms} freedoms, and no forces that are "
+                "determined; it cannot start from rest"
+            )
+        # (5,): with one freedom the direction, of length one in the metric M5
+        self.heading = self.freedoms[:, 0] if freedoms == 1 else None
+        # [kg^(1/2) m/s^2]: of accelerations in the metric M5
+        self.unit = math.sqrt(scales.mass) * scales.acceleration
 
     @cached_property
     def sliding(self) -> tuple[StartMode, ...]:
         """Start modes without sticking: two with one freedom, all sign patterns with more."""
-        if self.heading is not None:
-            ways = self.heading, -self.heading
-            modes = (self._build(find_mode(self.formation, self._find_signs(h)), h) for h in ways)
-            return tuple(mode for mode in modes if mode is not None)
-        return self._list_patterns(held=False)
+        if self.heading is None:
+            return self._list_patterns(held=False)
+        ways = zip(self._find_signs(self.heading), (self.heading, -self.heading), strict=True)
+        modes = [self._build(find_mode(self.formation, signs), way) for signs, way in ways]
+        return tuple(mode for mode in modes if mode is not None)
 
     @cached_property
     def sticking(self) -> tuple[StartMode, ...]:
@@ -314,15 +319,15 @@ class Rest:
     @cached_property
     def touching(self) -> Statics:
         """That of every contact that touches, in the formation or not."""
-        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.statics.near)]
+        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.near)]
         contacts = *self.formation.contacts, *(contact for contact in gained if contact)
-        return Statics(Formation(self.formation.scene, contacts), self.z)
+        return Statics(Formation(self.scene, contacts), self.z)
 
     @cached_property
     def held(self) -> TorquePolygon:
         """Torques that friction can hold, and those beyond by no more than rounding."""
         polygon = self.touching.torque_polygon()
-        return polygon._replace(bounds=polygon.bounds + 1e-6 * self.formation.scene.scales.torque)
+        return polygon._replace(bounds=polygon.bounds + 1e-6 * self.scene.scales.torque)
 
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
@@ -333,51 +338,47 @@ class Rest:
         return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
-        """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
-        formation, scales = self.formation, self.formation.scene.scales
-        fastest = np.abs(heading / build_system(formation.scene).units[:5]).max()
-        rates = np.concatenate([self.statics.A_t @ heading, heading[3:]])
-        rates[list(formation.rolling_rows)] = 0.0
-        # How fast each slides or turns over how fast anything moves.
-        scale = fastest * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
-        still = np.abs(rates) < 1e-9 * scale
-        still[list(formation.rolling_rows)] = False
-        if still.any():
-            # What is stationary here has the direction that it has just after.
-            at = formation.evaluate(self.z[None], heading[None])
-            bend = -move_least(at.P, at.P_dot_v, formation.scene.mass_diagonal)[0]
-            rows = evaluate_rows(formation, self.z, heading)
-            ahead = rows.A_t @ bend + rows.bend_t
-            moves = np.abs(ahead) > 1e-7 * fastest * scale
-            rates = np.where(still, np.where(moves, ahead, 0.0), rates)
-        return np.asarray(np.sign(rates))
+        """Directions of contacts and joints along the only freedom and back, (2, n_c + 2).
+
+        What is stationary here has the direction that it has just after; zero if it stays so.
+        """
+        scene = self.scene
+        # In which something moves by its unit; just after is 1e-5 of it later.
+        time = 1 / np.abs(heading / build_system(scene).units[:5]).max()
+        units = np.repeat([scene.scales.length, 1.0], [self.formation.n_contacts, 2]) / time
+        at = self.formation.evaluate(self.z[None], heading[None])
+        bend = -solve_min_norm(at.P, at.P_dot_v, scene.mass_diagonal)[0]
+        rows = evaluate_rows(self.formation, self.z, heading)
+        later = 1e-5 * time * (rows.A_t @ bend + rows.bend_t)
+        rates = np.outer([1.0, -1.0], rows.A_t @ heading) + later
+        rates[:, list(self.formation.rolling_rows)] = 0.0
+        return np.sign(np.where(np.abs(rates) > 1e-12 * units, rates, 0.0))
 
     def _build(self, mode: Mode, heading: Array | None = None) -> StartMode | None:
         """The start mode of a mode; None if its forces are not determined."""
-        scene, count = self.formation.scene, self.formation.n_contacts
-        still, A_t = np.zeros(count + 2), np.vstack([self.statics.A_t, _JOINTS])
-        rows = ContactRows(self.statics.A, A_t, still[:count], still, still)
+        mass, scales, count = self.scene.mass_diagonal, self.scene.scales, self.formation.n_contacts
+        none, A_t = np.zeros(count + 2), np.vstack([self.A_t, _JOINTS])
+        rows = ContactRows(self.A, A_t, none[:count], none, none)
         response = respond(mode, rows, np.zeros(5))
         if response is None:
             return None
         declared = [mode.declares(k) for k in range(len(mode.holders))]
-        kept = np.array([True] * count + declared + declared)
-        scales, length = scene.scales, scene.scales.length
-        slips = mode.signs[:, None] * response.rates
+        kept, limits = np.array([True] * count + declared + declared), response.force_limits
+        units = np.repeat([scales.acceleration, scales.rate / scales.time], [count, 2])
+        slips = (mode.signs / units)[:, None] * response.rates
         # What opens, or closes by no more than counts as grazing.
-        graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
-        openings = self.statics.opening[0] @ response.acceleration + graze
-        still = STILL * np.repeat([scales.acceleration, scales.rate / scales.time], [count, 2])
+        openings = self.opening[0] @ response.acceleration / scales.acceleration
+        openings += GRAZE * slips.sum(axis=0)
         # Difference quotients are as good as 1e-7.
-        closing = np.full(len(openings), 1e-7 * scales.acceleration)
+        still, closing = STILL, 1e-7
         if heading is not None:
             # All accelerations are multiples of this one.
-            slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
-            still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
-        rounding, limits = ROUNDING_FORCE * mode.force_limit_units, response.force_limits
+            slips = (heading * mass @ response.acceleration)[None] / self.unit
+            still, closing = -STILL, 0.0
         margins = np.vstack([limits[kept], slips, limits[~kept], openings])
-        margins[:, 0] += np.concatenate([rounding[kept], still, rounding[~kept], closing])
-        return StartMode(response, limits[kept], slips, margins, heading, self.statics)
+        sizes = [kept.sum(), len(slips), (~kept).sum(), len(openings)]
+        margins[:, 0] += np.repeat([ROUNDING_FORCE, still, ROUNDING_FORCE, closing], sizes)
+        return StartMode(response, limits[kept], slips, margins, heading, self)
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
@@ -392,7 +393,7 @@ class Rest:
             reserves = -normals @ coefficients
             reserves[:, 0] += bounds
             loss = find_breach(reserves, x)
-        least, every = 1e3 * _measure_drive(self.formation.scene), list(self.list_modes())
+        every = list(self.list_modes())
         margins = [mode.margins for mode in every]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
@@ -408,7 +409,7 @@ class Rest:
                 break
             modes = [every[k] for k in np.flatnonzero(chosen)]
             for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
-                if mode.drive(tau) > least and mode.moves(tau):
+                if mode.drive(tau) > 1e3 * STILL * self.unit and mode.moves(tau):
                     return mode.depart(start, tau)
         return self._collapse(coefficients, loss) if loss <= 1 else None
 
@@ -423,6 +424,7 @@ class Rest:
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
+            weakest = weakest * self.scene.scales.force
             normal, *cones = np.split(weakest, np.cumsum([count, rolls]))
             row, c_t = int(normal.argmin()), None
             if normal[row] >= 0 and rolls:
@@ -431,23 +433,6 @@ class Rest:
             return Collapse(x, self.formation.names[row], float(normal[row]), jams, c_t)
         row = int(pulls.argmax())
         return Collapse(x, self.touching.formation.names[row], -float(pulls[row]), jams)
-
-
-def find_rest(formation: Formation, z: Array) -> Rest:
-    """Formation at rest at `z`, (5,); `SimulationError` for dependent contacts or no freedom."""
-    statics = Statics(formation, z)
-    freedoms = statics.freedoms.shape[1]
-    if freedoms > 5 - formation.n_constraints or not freedoms:
-        raise SimulationError(
-            f"{' '.join(formation.names)} leaves {freedoms} freedoms, and no forces that are "
-            "determined; it cannot start from rest"
-        )
-    return Rest(formation, z, statics, statics.freedoms[:, 0] if freedoms == 1 else None)
-
-
-def _measure_drive(scene: Scene) -> float:
-    """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
-    return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
 
 
 def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
@@ -556,20 +541,16 @@ def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
     """Rows that have to be positive at rest, over their saturation values, shape (k, 3)."""
-    touching, z = place.touching, place.z
-    scene = touching.scene
-    static = Statics(touching, z).torque_polygon(epsilon)
-    rows = [np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)]
-    A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
-    count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
-    ample = AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration
-    for kept in combinations(touching.contacts, 4) if count == 5 else ():
-        others = [k for k, contact in enumerate(touching.contacts) if contact not in kept]
+    statics, contacts = Statics(place.touching, place.z), place.touching.contacts
+    held, scene = statics.torque_polygon(epsilon), statics.scene
+    rows = [np.column_stack([held.bounds, -held.normals]) / (AMPLE * scene.scales.torque)]
+    for kept in combinations(contacts, 4) if not statics.freedoms.size else ():
+        others = [k for k, contact in enumerate(contacts) if contact not in kept]
         # Motions that give up the other contacts.
         rows += [
-            -mode.slips / ample
-            for mode in _list_sliding(Formation(scene, kept), z)
-            if mode.heading is not None and (A[others] @ mode.heading >= -_SMALL).all()
+            -mode.slips / AMPLE
+            for mode in _list_sliding(Formation(scene, kept), place.z)
+            if mode.heading is not None and (statics.A[others] @ mode.heading >= -_SMALL).all()
         ]
     return np.vstack(rows)
 
@@ -577,7 +558,7 @@ def _list_holding(place: Standstill, epsilon: float) -> Array:
 def _list_sliding(formation: Formation, z: Array) -> tuple[StartMode, ...]:
     """Start modes without sticking that do not jam; none if contacts depend on each other."""
     try:
-        return tuple(mode for mode in find_rest(formation, z).sliding if mode.response.ratio > 0)
+        return tuple(mode for mode in Rest(formation, z).sliding if mode.response.ratio > 0)
     except SimulationError:
         return ()
 
@@ -587,9 +568,8 @@ def find_opening(place: Standstill) -> Array | None:
     if place.gained is None:
         return None
     scene = place.formation.scene
-    at = place.z[None], np.zeros((1, 5))
-    normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
-    N = find_freedoms(place.formation.evaluate(*at).P[0], scene.mass_diagonal, _SMALL)
+    normal = Statics(Formation(scene, (place.gained,)), place.z).A[0]
+    N = Statics(place.formation, place.z).freedoms
     push = N.T @ normal
     rate = float(push @ push)
     if rate <= 3e-5 * float(normal**2 @ (1 / scene.mass_diagonal)):
@@ -601,16 +581,13 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
     """Torques of largest margin that accelerate the formation towards a contact open by `gap`."""
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
-    normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
+    normal = Statics(Formation(scene, (place.gained,)), z).A[0]
     scales, held = scene.scales, Statics(place.formation, z).torque_polygon()
-    creep = DRIVE * np.repeat(
-        [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
-    )
     best: Hold | None = None
     for mode in _list_sliding(place.formation, z):
         rows, closing = rest, -normal @ mode.response.acceleration
         if mode.heading is None:
-            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.mode.signs != 0]])
+            rows = np.vstack([rest, mode.slips[mode.response.mode.signs != 0] / DRIVE])
         elif normal @ mode.heading >= 0:
             continue
         enough = closing - [DRIVE * scales.acceleration, 0.0, 0.0]

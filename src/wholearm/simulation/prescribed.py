@@ -358,12 +358,12 @@ class Replay(Run):
         self.record(still=True)
         if self.is_there():
             return self._arrive(self.rest_window)
-        rest, sticks = modes.find_rest(self.formation, self.z), False
+        rest, sticks = modes.Rest(self.formation, self.z), False
         # After a motion statics may leave open whether what the next phase releases still presses:
         # it does not where that phase starts. Case: phase 3 of query 44 with limited rates.
         leaving = None
         if self.releasable and self.following and self.heading.any():
-            leaving = modes.find_rest(self.following.formation, self.z)
+            leaving = modes.Rest(self.following.formation, self.z)
         while True:
             if self.t >= self.breaks[-1]:
                 return self.run_out()
@@ -637,7 +637,7 @@ class Replay(Run):
         """Plastic impact onto the next formation; the outcome if it is not possible."""
         z = self._close(following.formation)
         impact = compute_impact(self.formation, following.formation, z, self.v)
-        name, least = impact.least
+        name, least = impact.least_impulse
         names = following.formation.names
         normal = impact.p[: len(names)]
         impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
@@ -893,7 +893,7 @@ class Replay(Run):
                     return None
                 acceleration = response.acceleration @ load
                 rates = rates + response.rates @ load / 2
-                held = response.force_limits @ load / mode.force_limit_units
+                held = response.force_limits @ load
             gained = mode.signs * rates / (speeds / scales.time)
             cones = held[count:].reshape(2, -1).min(axis=0)
             margins = [np.inf]

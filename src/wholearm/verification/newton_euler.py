@@ -1,8 +1,8 @@
 """Newton's and Euler's equations, body by body, as an independent check of motion and forces.
 
-Geometry, velocities and forces are written out anew here, in plain NumPy, from the data model:
-nothing is shared with the equations of motion that planner and simulator use. With the contact
-point p and the normal n into the object, t = (n_y, -n_x), and the force f = c_n n + c_t t,
+Geometry, velocities and forces are derived here in NumPy from the data model: nothing is shared
+with the equations of motion that planner and simulator use. With the contact point p and the normal
+n into the object, t = (n_y, -n_x), and the force f = c_n n + c_t t,
 
     m (x'', y'') = (0, -m g) + sum f,             I phi'' = sum (p - (x, y)) x f,
     J_i theta_i'' = tau_i - B_i theta_i' - d_i - sum (p - base_i) x f.
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from ..contacts.elemental import Contact
     from ..results.trajectory import Samples
 
-STILL = 1e-4  # speed that counts as none, relative to the scene's speed
-# How far friction without motion may be out of its cone, relative to the scene's force: plans keep
-# limits to 1e-7 of the largest forces. Case: a contact of query 54 that slips under rate limits.
-BEYOND = 2e-6
+REST_SPEED = 1e-4  # largest speed of rest, relative to the scene's speed
+# Tolerance of static friction outside its cone, relative to the scene's force: plans keep limits to
+# 1e-7 of the largest forces. Case: a contact of query 54 that slips under rate limits.
+CONE_TOLERANCE = 2e-6
 BODIES = (
     "the object along x",
     "the object along y",
@@ -42,18 +42,18 @@ BODIES = (
 class Balance(NamedTuple):
     """Residuals of the equations of motion and contact conditions at n instants."""
 
-    forces: Array  # (n, 5): left over in each of `BODIES`, relative to the scene's force or torque
+    forces: Array  # (n, 5): residuals of `BODIES`, relative to the scene's force or torque
     gaps: Array  # (n, n_c): of the contacts, relative to the scene's length
     # (n, n_c): normal velocities of the contacts, and of rolling ones the larger of normal and
     # tangential velocity, relative to the scene's speed
     rates: Array
-    # (n, n_c + 2): where contacts slide and joints turn against the sense that the motion's
-    # friction assumes
-    against: Flags
+    # (n, n_c + 2): whether contacts slide or joints turn in the direction opposite to the one that
+    # the motion's friction assumes
+    wrong_sign: Flags
     names: tuple[str, ...]  # of the contacts
 
     def find_worst(self) -> tuple[float, int, str]:
-        """The largest of all numbers, at which instant, and what it is of in words."""
+        """The largest residual, its instant, and a description."""
         contacts = self.names
         tables = (
             (self.forces, BODIES, "the equation of motion of {} misses {:.2g} of {}"),
@@ -67,17 +67,17 @@ class Balance(NamedTuple):
         unit = ("the scene's force or torque", "the scene's length", "the scene's speed")[worst]
         text = text.format(names[column], sizes[worst], unit)
         names = (*contacts, "joint 1", "joint 2")
-        turned = [name for name, wrong in zip(names, self.against[row], strict=True) if wrong]
-        if worst == 0 and turned:
-            text += f", as {' and '.join(turned)} moves against the sense that its friction assumes"
+        movers = [name for name, wrong in zip(names, self.wrong_sign[row], strict=True) if wrong]
+        if worst == 0 and movers:
+            text += f", as {' and '.join(movers)} moves against the sense that its friction assumes"
         return sizes[worst], row, text
 
 
-class Touch(NamedTuple):
+class ContactGeometry(NamedTuple):
     """A contact at n configurations."""
 
     gap: Array  # (n,) [m]
-    # low, high (n,) [m]: how far the contact is inside both ends of the feature that it slides on;
+    # low, high (n,) [m]: distances of the contact from both ends of the feature that it slides on;
     # infinite where the feature has no end of its own
     low: Array
     high: Array
@@ -94,43 +94,42 @@ def balance(
     contacts: Sequence[Contact],
     rolling: Sequence[Contact],
     samples: Samples,
-    still: float = STILL,
+    rest_speed: float = REST_SPEED,
 ) -> Balance:
     """Residuals of a motion with its forces in the Newton-Euler equations.
 
-    Contacts are in the order of the samples' forces; `rolling` are those of them that roll. Below
-    the speed `still`, relative to the scene's, angular ones times the scene's length, nothing
-    moves.
+    Contacts are in the order of the samples' forces; `rolling` ones do not slide. Speeds below
+    `rest_speed`, relative to the scene's, angular ones times the scene's length, count as rest.
     """
     z, v, scales = samples.z, samples.z_dot, scene.scales
-    slow = still * scales.speed
-    left = scene.applied_force - scene.mass_diagonal * samples.z_ddot
-    left[:, 3:] += samples.tau
+    slow = rest_speed * scales.speed
+    residual = scene.applied_force - scene.mass_diagonal * samples.z_ddot
+    residual[:, 3:] += samples.tau
     gaps, rates = np.zeros(samples.c_n.shape), np.zeros(samples.c_n.shape)
-    against = np.zeros((len(z), len(contacts) + 2), dtype=bool)
+    wrong_sign = np.zeros((len(z), len(contacts) + 2), dtype=bool)
     for k, contact in enumerate(contacts):
-        touch, c_n, c_t = locate(scene, contact.name, z), samples.c_n[:, k], samples.c_t[:, k]
-        v_n, v_t = dot(touch.normal, v), dot(touch.tangent, v)
-        bound = touch.friction * c_n
+        place, c_n, c_t = locate(scene, contact.name, z), samples.c_n[:, k], samples.c_t[:, k]
+        v_n, v_t = dot(place.normal, v), dot(place.tangent, v)
+        bound = place.friction * c_n
         slides = np.abs(v_t) > slow
         if contact in rolling:
             slides[:] = False
             v_n = np.maximum(np.abs(v_n), np.abs(v_t))
-        held = bound + BEYOND * scales.force
-        friction = np.where(slides, -bound * np.sign(v_t), np.clip(c_t, -held, held))
-        left += c_n[:, None] * touch.normal + friction[:, None] * touch.tangent
-        gaps[:, k], rates[:, k] = touch.gap, v_n
-        against[:, k] = slides & (np.abs(friction - c_t) > 1e-6 * scales.force)
+        static = bound + CONE_TOLERANCE * scales.force
+        friction = np.where(slides, -bound * np.sign(v_t), np.clip(c_t, -static, static))
+        residual += c_n[:, None] * place.normal + friction[:, None] * place.tangent
+        gaps[:, k], rates[:, k] = place.gap, v_n
+        wrong_sign[:, k] = slides & (np.abs(friction - c_t) > 1e-6 * scales.force)
     for k, link in enumerate(scene.fingers):
-        turn, row = v[:, 3 + k], left[:, 3 + k]
-        row -= link.viscous * turn
-        turns = scales.length * np.abs(turn) > slow
-        row -= np.where(turns, link.dry * np.sign(turn), np.clip(row, -link.dry, link.dry))
-        other = np.abs(row + 2 * link.dry * np.sign(turn)) < 1e-6 * scales.torque
-        against[:, len(contacts) + k] = turns & other & (np.abs(row) > 1e-6 * scales.torque)
-    left /= np.array([scales.force] * 2 + [scales.torque] * 3)
+        rate, row = v[:, 3 + k], residual[:, 3 + k]
+        row -= link.viscous * rate
+        turning = scales.length * np.abs(rate) > slow
+        row -= np.where(turning, link.dry * np.sign(rate), np.clip(row, -link.dry, link.dry))
+        opposite = np.abs(row + 2 * link.dry * np.sign(rate)) < 1e-6 * scales.torque
+        wrong_sign[:, len(contacts) + k] = turning & opposite & (np.abs(row) > 1e-6 * scales.torque)
+    residual /= np.array([scales.force] * 2 + [scales.torque] * 3)
     names = tuple(contact.name for contact in contacts)
-    return Balance(left, gaps / scales.length, rates / scales.speed, against, names)
+    return Balance(residual, gaps / scales.length, rates / scales.speed, wrong_sign, names)
 
 
 def place_object(scene: Scene, z: Array) -> Array:
@@ -144,8 +143,8 @@ def link_axis(z: Array, finger: int) -> Array:
     return np.array([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])]).T
 
 
-def locate(scene: Scene, name: str, z: Array) -> Touch:
-    """The contact called `name` at n configurations `z`, shape (n, 5), which may be complex."""
+def locate(scene: Scene, name: str, z: Array) -> ContactGeometry:
+    """Geometry of contact `name` at n configurations `z`, shape (n, 5), which may be complex."""
     feature, part = name.split("-")
     index, vertices = int(feature[1:]), scene.polygon.vertices
     turn = np.cos(z[:, 2]), np.sin(z[:, 2])
@@ -179,7 +178,7 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
         row[:, :2], row[:, 2] = direction, cross_product(point - z[:, :2], direction)
         if finger is not None:
             row[:, 3 + finger] = -cross_product(point - base, direction)
-    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger), point)
+    return ContactGeometry(gap, low, high, rows[0], rows[1], scene.friction.of(finger), point)
 
 
 def _rotate(vector: Array, c: Array, s: Array) -> Array:
@@ -189,7 +188,7 @@ def _rotate(vector: Array, c: Array, s: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Products of vectors along the last axis."""
+    """Scalar products of vectors along the last axis."""
     return np.asarray((a * b).sum(axis=-1))
 
 

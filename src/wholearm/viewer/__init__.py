@@ -1,1 +1,1 @@
-"""Motions to look at: movies, pages that play them, and reports in one file."""
+"""Presentation of motions: movies, pages with players, and reports in one file."""

@@ -29,17 +29,17 @@ from ..scene.model import Scene
 from ..verification.newton_euler import locate
 
 FRAMES = 25  # frames in a second of the movie
-TURNS, GHOST = "#D55E00", "#bbbbbb"
-"""Colours of torques and the cursor, and of what is drawn behind."""
+ACCENT, GHOST = "#D55E00", "#bbbbbb"
+"""Colours of torques and the cursor, and of the replay in the background."""
 
 
 def _prepare_scene(
     axes: Axes, scene: Scene, trajectory: Trajectory, ghost: Trajectory | None
 ) -> Callable[[float], list[Artist]]:
-    """What draws hand, object and forces on axes at an instant, anew for each frame."""
-    touches = [locate(scene, name, trajectory.z) for name in trajectory.contacts]
+    """Function that draws hand, object and forces on axes at an instant."""
+    contacts = [locate(scene, name, trajectory.z) for name in trajectory.contacts]
     points, normals, tangents = (  # (n, m, 2)
-        np.stack([getattr(touch, name)[:, :2] for touch in touches], axis=1)
+        np.stack([getattr(contact, name)[:, :2] for contact in contacts], axis=1)
         for name in ("point", "normal", "tangent")
     )
     forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
@@ -47,7 +47,7 @@ def _prepare_scene(
     size = float((high - low).max())
     styles = style.choose_styles(trajectory.contacts)
     colours = [styles[name].colour for name in trajectory.contacts]
-    # Square roots: small forces are to be seen beside large ones.
+    # Square roots, so that small forces are visible beside large ones.
     strengths = np.hypot(*forces.T).T[..., None]
     strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
     scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
@@ -55,11 +55,11 @@ def _prepare_scene(
     presses = np.asarray(np.isfinite(forces).all(axis=2))
     # Friction cones are longer than the arrows in them.
     reach = 1.15 * np.maximum(np.hypot(*arrows.T).T, 0.03 * size)[..., None]
-    edges = np.array([[touch.friction] for touch in touches]) * tangents
+    edges = np.array([[contact.friction] for contact in contacts]) * tangents
     sides = [points + reach * (normals + sign * edges) for sign in (1, -1)]
     cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
-    every = np.vstack([low, high, cones[presses].reshape(-1, 2)])
-    low, high = every.min(axis=0) - 0.05 * size, every.max(axis=0) + 0.05 * size
+    corners = np.vstack([low, high, cones[presses].reshape(-1, 2)])
+    low, high = corners.min(axis=0) - 0.05 * size, corners.max(axis=0) + 0.05 * size
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal")
     axes.set_axis_off()
@@ -69,13 +69,13 @@ def _prepare_scene(
     numbers = vertices[[*shifts]] + np.reshape([*shifts.values()], (-1, 2)) / scale
 
     def draw(t: float) -> list[Artist]:
-        """Everything at an instant, in the order of drawing."""
+        """All artists at an instant, in the order of drawing."""
         artists = list[Artist]()
         row = max(0, int(np.searchsorted(trajectory.t, t, side="right")) - 1)
         z = interpolate(t, trajectory.t, trajectory.z)
         if ghost is not None:
-            behind = interpolate(t, ghost.t, ghost.z)
-            artists += plots.draw_bodies(axes, scene, behind, ec=GHOST, fc="none")
+            ghost_z = interpolate(t, ghost.t, ghost.z)
+            artists += plots.draw_bodies(axes, scene, ghost_z, ec=GHOST, fc="none")
         artists += plots.draw_bodies(axes, scene, z)
         c, s = math.cos(z[2]), math.sin(z[2])
         places = z[:2] + numbers @ np.array([[c, s], [-s, c]])
@@ -93,28 +93,28 @@ def _prepare_scene(
             dot: Any = {"marker": "o", "ms": 5.5, "mfc": colours[k], "mec": "white"}
             artists.append(style.add_line(axes, points[row, [k]], **dot))
         for finger, torque in zip(scene.fingers, trajectory.tau[row].tolist(), strict=True):
-            # At the limit an arc of three quarters.
-            swept = 1.5 * math.pi * torque / finger.torque_limit
-            arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * size)
-            artists.append(style.add_line(axes, arc, color=TURNS, lw=1.6))
+            # An arc of three quarters of a circle is the torque limit.
+            angle = 1.5 * math.pi * torque / finger.torque_limit
+            arc = _trace_arc(np.asarray(finger.base), angle, 0.05 * size)
+            artists.append(style.add_line(axes, arc, color=ACCENT, lw=1.6))
         return artists + plots.draw_joints(axes, scene)
 
     return draw
 
 
-def _trace_arrow(start: Array, along: Array, head: float) -> Array:
+def _trace_arrow(start: Array, vector: Array, head: float) -> Array:
     """An arrow as one line, shape (5, 2)."""
-    length = float(np.hypot(*along)) or 1.0
-    axis = min(head, length) * along / length
-    across, end = 0.5 * np.array([axis[1], -axis[0]]), start + along
-    return np.array([start, end, end - axis + across, end, end - axis - across])
+    length = float(np.hypot(*vector)) or 1.0
+    axis = min(head, length) * vector / length
+    side, end = 0.5 * np.array([axis[1], -axis[0]]), start + vector
+    return np.array([start, end, end - axis + side, end, end - axis - side])
 
 
-def _trace_arc(base: Array, turn: float, radius: float) -> Array:
+def _trace_arc(base: Array, angle: float, radius: float) -> Array:
     """An arc about a joint from below it, with an arrow head."""
-    angles = -np.pi / 2 + np.linspace(0.0, turn, 24)
-    back = angles[-1] - np.sign(turn) * min(0.5, abs(turn))
-    angles = np.append(angles, [back, angles[-1], back])
+    angles = -np.pi / 2 + np.linspace(0.0, angle, 24)
+    tail = angles[-1] - np.sign(angle) * min(0.5, abs(angle))
+    angles = np.append(angles, [tail, angles[-1], tail])
     radii = radius * np.append(np.ones(24), [1.2, 1.0, 0.8])
     return np.asarray(base + radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
@@ -141,10 +141,10 @@ def write_movie(
     ffmpeg for an MP4, or the file cannot be written.
     """
     speed = require_number(speed, "--speed", positive=True)
-    duration, most = trajectory.duration, 120 * FRAMES
+    duration, max_frames = trajectory.duration, 120 * FRAMES
     count = math.ceil(duration / speed * FRAMES) + 1
-    if count > most:
-        least = duration * FRAMES / most
+    if count > max_frames:
+        least = duration * FRAMES / max_frames
         text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
         raise InputError("", "--speed", text)
     times = np.linspace(0.0, duration, max(2, count))
@@ -169,19 +169,19 @@ def write_movie(
             torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, duration))
             figure.align_ylabels([margins, torques])
             canvas.draw()
-            still = canvas.copy_from_bbox(figure.bbox)
+            background = canvas.copy_from_bbox(figure.bbox)
             form = fixed(min(duration, 0.9))
             look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
             for k, t in enumerate(times.tolist(), start=1):
-                canvas.restore_region(still)
-                moving = draw_scene(t)
+                canvas.restore_region(background)
+                artists = draw_scene(t)
                 for axes in (margins, torques):
-                    cursor: Any = {"color": TURNS, "lw": 1.3}
+                    cursor: Any = {"color": ACCENT, "lw": 1.3}
                     cursor["transform"] = axes.get_xaxis_transform()
-                    moving.append(style.add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
+                    artists.append(style.add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
                 text = f"{problem.name}   t = {t:{form}} s"
-                moving.append(figure.text(0.02, 0.975, text, **look))
-                for artist in moving:
+                artists.append(figure.text(0.02, 0.975, text, **look))
+                for artist in artists:
                     figure.draw_artist(artist)
                     artist.remove()
                 progress(f"frame {k} of {len(times)}")
@@ -190,7 +190,7 @@ def write_movie(
     pictures = draw()
     if str(path).lower().endswith(".gif"):
         images = [Image.fromarray(picture[..., :3]) for picture in pictures]
-        # One palette for all, so that what stays the same is stored once.
+        # One palette for all frames, so that constant parts are stored once.
         palette = _choose_palette(images)
         frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options: Any = {"format": "GIF", "save_all": True, "loop": 0, "optimize": False}
@@ -202,27 +202,27 @@ def write_movie(
 
 
 def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
-    """A palette for all of a movie in which every colour that has a meaning is there as it is.
+    """A palette for a movie with the exact colours of all elements.
 
-    The rest are the colours of four pictures, mostly tints of these.
+    The others are the colours of four pictures, mostly tints of these.
     """
     colours = [*style.PALETTE, style.BAND, style.LOW, style.LOST, style.INK, style.GRID]
-    colours += ["#ffffff", style.BODY, TURNS, GHOST, *chain(*style.FINGERS)]
+    colours += ["#ffffff", style.BODY, ACCENT, GHOST, *chain(*style.FINGERS)]
     exact = np.array([ImageColor.getrgb(colour) for colour in colours])
-    some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
-    strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
-    for k, image in enumerate(some):
+    samples = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
+    strip = Image.new("RGB", (samples[0].width, 4 * samples[0].height))
+    for k, image in enumerate(samples):
         strip.paste(image, (0, k * image.height))
     tints = np.reshape(strip.quantize(96).getpalette() or [], (-1, 3))[:96]
-    # Pillow looks up colours in cells of 4 levels: a tint nearby could take the place of an own.
-    apart = np.abs(tints[:, None] - exact).max(axis=2).min(axis=1) >= 12
+    # Pillow looks up colours in cells of 4 levels: a similar tint could replace an exact colour.
+    distinct = np.abs(tints[:, None] - exact).max(axis=2).min(axis=1) >= 12
     palette = Image.new("P", (1, 1))
-    palette.putpalette(np.vstack([exact, tints[apart]]).ravel().tolist())
+    palette.putpalette(np.vstack([exact, tints[distinct]]).ravel().tolist())
     return palette
 
 
 def _encode(pictures: Iterator[Array], path: str | os.PathLike[str]) -> bytes:
-    """An MP4 of pictures."""
+    """Content of an MP4 file of pictures."""
     program = shutil.which("ffmpeg")
     if program is None:
         text = "MP4 needs ffmpeg, which is not there; .gif and .html do not"
@@ -230,10 +230,10 @@ def _encode(pictures: Iterator[Array], path: str | os.PathLike[str]) -> bytes:
     first = next(pictures)
     height, width = first.shape[:2]
     raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", str(FRAMES)]
-    even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+    output = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
     with tempfile.TemporaryDirectory() as folder:
         target = os.path.join(folder, "movie.mp4")
-        command = [program, "-y", "-loglevel", "error", *raw, "-i", "-", *even, target]
+        command = [program, "-y", "-loglevel", "error", *raw, "-i", "-", *output, target]
         with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
             assert process.stdin is not None
             process.stdin.write(first.tobytes())

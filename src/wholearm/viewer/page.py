@@ -1,4 +1,4 @@
-"""Pages in one file, which open without a network: text, tables, pictures, players of motions."""
+"""HTML pages in one file that need no network: text, tables, pictures, players of motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array, Numbers, find_runs
-from ..common.document import plain
+from ..common.document import to_plain
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
@@ -21,7 +21,7 @@ from ..verification.newton_euler import locate
 
 
 def build_page(title: str, parts: Iterable[str]) -> str:
-    """A page of HTML of `parts`, as other functions of this module make them, with their script."""
+    """A page of HTML of `parts`, from other functions of this module, with style and script."""
     folder = resources.files(__package__)
     style, script = (folder.joinpath(f"viewer.{kind}").read_text("utf-8") for kind in ("css", "js"))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -31,25 +31,25 @@ def build_page(title: str, parts: Iterable[str]) -> str:
 
 
 def fold(content: str, title: str) -> str:
-    """HTML folded away under a title."""
+    """HTML that is collapsed under a title."""
     return f"<details><summary>{escape(title)}</summary>{content}</details>"
 
 
 def write_player(motion: dict[str, Any]) -> str:
-    """A motion to play; see `describe_motion`."""
+    """HTML of a player of a motion; see `describe_motion`."""
     return f'<div class="motion">{_embed(motion)}</div>'
 
 
-def write_chart(drawing: str, places: dict[str, Any]) -> str:
-    """A map whose places can be clicked; see `report_page.describe_map`."""
+def write_map(drawing: str, places: dict[str, Any]) -> str:
+    """HTML of a map with places that can be clicked; see `report_page.describe_map`."""
     hint = "Click a cell, a border or a crossing to see what touches there."
-    told = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
-    wide = f'<div class="scroll"><div class="map">{drawing}</div></div>'
-    return f'<div class="chart">{wide}{told}{_embed(places)}</div>'
+    details = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
+    map_box = f'<div class="scroll"><div class="map">{drawing}</div></div>'
+    return f'<div class="chart">{map_box}{details}{_embed(places)}</div>'
 
 
 def _embed(value: dict[str, Any]) -> str:
-    """Plain values for a script; a name with a tag in it cannot end them."""
+    """Values for a script as JSON, in which tags are escaped."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json">{text}</script>'
 
@@ -57,10 +57,10 @@ def _embed(value: dict[str, Any]) -> str:
 def describe_motion(
     trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = 4000
 ) -> dict[str, Any]:
-    """What a page needs to play a motion, of `most` samples or so, with a replay behind it."""
+    """Data of a player for a motion of about `most` samples, with a replay in the background."""
     scene, styles = problem.scene, choose_styles(trajectory.contacts)
-    every = trajectory.find_steps()
-    rows = _choose_rows(trajectory, every, most)
+    steps = trajectory.find_steps()
+    rows = _choose_rows(trajectory, steps, most)
     contacts = list[dict[str, Any]]()
     for index, name in enumerate(trajectory.contacts):
         touch = locate(scene, name, trajectory.z[rows])
@@ -69,34 +69,34 @@ def describe_motion(
         spans = [
             {
                 "first": run.start,
-                "point": fix(touch.point[run], scene),
-                "normal": fix(touch.normal[run, :2], scene),
+                "point": round_z(touch.point[run], scene),
+                "normal": round_z(touch.normal[run, :2], scene),
                 "c": _round(c[run]),
             }
-            for run in find_runs(np.isfinite(c).all(axis=1), least=2)
+            for run in find_runs(np.isfinite(c).all(axis=1), min_length=2)
         ]
         dashes = [] if styles[name].line == "-" else list(styles[name].line[1])
         look = {"name": name, "colour": styles[name].colour, "dashes": dashes}
         contacts.append(look | {"friction": touch.friction, "spans": spans})
-    behind = None
+    background = None
     if ghost is not None:
-        few = _choose_rows(ghost, every[:0], most)
-        behind = {"t": _round(ghost.t[few]), "z": fix(ghost.z[few], scene)}
+        few = _choose_rows(ghost, steps[:0], most)
+        background = {"t": _round(ghost.t[few]), "z": round_z(ghost.z[few], scene)}
     return describe_hand(scene) | {
         "epsilon": problem.epsilon,
         "t": _round(trajectory.t[rows]),
-        "z": fix(trajectory.z[rows], scene),
+        "z": round_z(trajectory.z[rows], scene),
         "tau": _round(trajectory.tau[rows]),
         "phase": trajectory.phase[rows].tolist(),
         "starts": _round(trajectory.phase_starts),
-        "steps": np.searchsorted(rows, every).tolist(),
+        "steps": np.searchsorted(rows, steps).tolist(),
         "contacts": contacts,
-        "ghost": behind,
+        "ghost": background,
     }
 
 
 def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
-    """Rows to show: all, or each so-manieth, ends of phases and both sides of steps."""
+    """Rows to show: even ones, about `most`, ends of phases and both sides of steps."""
     count = len(trajectory.t)
     joints = np.flatnonzero(np.diff(trajectory.phase)) + 1
     ends = np.concatenate([[0, count - 1], joints - 1, joints, steps - 1, steps])
@@ -104,7 +104,7 @@ def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
 
 
 def describe_hand(scene: Scene) -> dict[str, Any]:
-    """The object and the fingers, as plain values."""
+    """Data of the object and the fingers, as plain values."""
     return {
         "vertices": scene.polygon.vertices.tolist(),
         "fingers": [
@@ -120,7 +120,7 @@ def describe_hand(scene: Scene) -> dict[str, Any]:
     }
 
 
-def fix(values: Array, scene: Scene) -> Any:
+def round_z(values: Array, scene: Scene) -> Any:
     """Nested lists of places, directions or angles [m, rad].
 
     They have 5 decimals for an object of a centimetre or more.
@@ -130,4 +130,4 @@ def fix(values: Array, scene: Scene) -> Any:
 
 def _round(values: Array) -> Any:
     """Nested lists of numbers with six digits, None where there is no number."""
-    return plain(np.reshape([float(f"{v:.6g}") for v in values.ravel().tolist()], values.shape))
+    return to_plain(np.reshape([float(f"{v:.6g}") for v in values.ravel().tolist()], values.shape))

@@ -23,7 +23,7 @@ from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
 from ..figures import plots
-from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
+from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split_regions
 from ..figures.style import STYLE
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import load
@@ -44,10 +44,10 @@ def build_report(
     progress: Callable[[str], None] = lambda text: None,
     sensitivities: bool = False,
 ) -> str:
-    """Put the plans (.npz) and torques (.csv) at `paths`, replayed, into one page of HTML.
+    """One page of HTML with replays of the plans (.npz) and torques (.csv) at `paths`.
 
-    It has the `text` of the problem file, a map, and, with `sensitivities`, what 1 % more of each
-    number is worth.
+    It has the `text` of the problem file, a map, and, with `sensitivities`, the effects of 1 % more
+    of each number.
 
     InputError if a file cannot be read, or is one of another problem; names the file.
     """
@@ -57,7 +57,7 @@ def build_report(
     parts = [comparison.summary.to_html()]
     for contender in comparison.contenders:
         progress(f"writing {contender.name}")
-        # All motions together leave a page at some 3 MB.
+        # With all motions a page has about 3 MB.
         parts += _describe(contender, 8000 // len(comparison.contenders))
     first = next(filter(None, (contender.planned for contender in comparison.contenders)), None)
     if sensitivities:
@@ -68,11 +68,11 @@ def build_report(
         parts += ["<h2>What 1 % more of each number is worth</h2>"]
         parts += [write_svg(draw_sensitivities(result)), result.document.to_html()]
     progress("map")
-    chart = build_map(problem, 90)
+    formation_map = build_map(problem, 90)
     machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
         "<h2>Contact formations</h2>",
-        page.write_chart(*describe_map(chart, first)),
+        page.write_map(*describe_map(formation_map, first)),
         "<h2>Problem</h2>",
         page.fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
         Document(f"wholearm {__version__}, {machine}").to_html(),
@@ -81,24 +81,24 @@ def build_report(
 
 
 def _describe(contender: Contender, most: int) -> list[str]:
-    """The section of one plan or table of torques: player, verdict, phases and joints.
+    """The section of one plan or table of torques: player, verdict, phases and junctions.
 
-    Of its motion `most` samples are taken, about.
+    The player has about `most` samples.
     """
     problem, planned, report = contender.problem, contender.planned, contender.report
     parts = [f"<h2>{escape(contender.name)}</h2>"]
     parts.append(Document("", contender.verdict, contender.reason).to_html())
     replayed = contender.replayed
-    shown = planned or replayed
-    if shown is not None and problem is not None:
+    motion = planned or replayed
+    if motion is not None and problem is not None:
         ghost = replayed if planned is not None else None
-        parts.append(page.write_player(page.describe_motion(shown, problem, ghost, most)))
-        timings = shown.meta.get("timings")
-        # Routes are planned from parts that are replayed before: then nothing is left of a step.
+        parts.append(page.write_player(page.describe_motion(motion, problem, ghost, most)))
+        timings = motion.meta.get("timings")
+        # Parts of routes are replayed before: steps of the whole then take no time.
         steps = timings.items() if isinstance(timings, dict) else ()
-        took = [(str(name), value) for name, value in steps if value and value >= 1e-3]
-        tables = [list_phases(problem, shown), list_joints(shown)]
-        tables.append(Table(["planning took", "[s]:.4g"], took))
+        durations = [(str(name), value) for name, value in steps if value and value >= 1e-3]
+        tables = [list_phases(problem, motion), list_junctions(motion)]
+        tables.append(Table(["planning took", "[s]:.4g"], durations))
         parts.append(Document("", parts=tables).to_html())
     if report is not None:
         parts.append(page.fold(report.document.to_html(), "what verify says"))
@@ -118,20 +118,20 @@ def list_phases(problem: Problem, trajectory: Trajectory) -> Table:
     return Table([*heads, "of"], rows)
 
 
-def list_joints(trajectory: Trajectory) -> Table:
-    """A row for each place where a phase passes into the next one."""
+def list_junctions(trajectory: Trajectory) -> Table:
+    """A row for each junction of two phases."""
     rows, planar = [], np.hypot(*trajectory.q_dot[:, :2].T)
     force = fixed(min(float(np.nanmax(trajectory.c_n, initial=0.0)), 10.0), 5)
     speed = fixed(min(float(planar.max()), 0.5), 4)
     torque = fixed(min(float(np.abs(trajectory.tau).max()), 2.0), 5)
     for last in np.flatnonzero(np.diff(trajectory.phase)):
-        # A replay has a rest of no duration, without forces, before torques that step.
+        # Before a step of torques a replay has a rest of zero duration, without forces.
         after = np.searchsorted(trajectory.t, trajectory.t[last + 1], side="right") - 1
         sides = [last, after]
         forces = [
-            f"{name}: {show(before, force)} \u2192 {show(later, force)}"
-            for name, before, later in zip(trajectory.contacts, *trajectory.c_n[sides], strict=True)
-            if math.isfinite(before) or math.isfinite(later)
+            f"{name}: {show(before, force)} \u2192 {show(after, force)}"
+            for name, before, after in zip(trajectory.contacts, *trajectory.c_n[sides], strict=True)
+            if math.isfinite(before) or math.isfinite(after)
         ]
         x, _, phi = trajectory.q[after]
         place = trajectory.t[after], x, phi
@@ -146,27 +146,27 @@ def list_joints(trajectory: Trajectory) -> Table:
 
 @exclusive
 def describe_map(chart: FormationMap, plan: Trajectory | None) -> tuple[str, dict[str, Any]]:
-    """A map with a plan, or the problem's own phases, as SVG, and what can be clicked on it.
+    """A map with a plan, or the problem's phases, as SVG, and data of its places for clicks.
 
     Returns
     -------
     drawing  with the ids of `figures.map_figure`
-    places   under "hand" the hand and the object; under "places", by their numbers in these ids,
-             `contacts`, a `text` and the poses `z` of what can be clicked; under "axes" where the
-             drawing has which x [mm] and phi [deg]
+    places   "hand": the hand and the object; "places": `contacts`, a `text` and the poses `z` of
+             the places, by their numbers in these ids; "axes": ranges of x [mm] and phi [deg], and
+             their box in the drawing
     """
     scene = chart.problem.scene
     with matplotlib.rc_context(STYLE | {"svg.fonttype": "none"}):
-        # Its style for nothing else in the page.
+        # Restrict its style to the map.
         drawing = write_svg(draw_map(chart, plan)).replace("*{", ".map *{")
-    parts = list(split(chart.cell))
+    parts = list(split_regions(chart.cell))
     step = np.array([np.ptp(chart.phi) / len(chart.phi), np.ptp(chart.x) / len(chart.x)])
-    rooms = [find_room(region, step / np.ptp(chart.x)) for _, region in parts]
-    middles = np.array([[chart.x[column], chart.phi[row]] for row, column, _ in rooms])
+    centres = [find_room(region, step / np.ptp(chart.x)) for _, region in parts]
+    middles = np.array([[chart.x[column], chart.phi[row]] for row, column, _ in centres])
     poses = close_fingers(scene, *middles.T).z
 
     def describe(contacts: Iterable[Contact], text: str, z: Array) -> dict[str, Any]:
-        return {"contacts": [c.name for c in contacts], "text": text, "z": page.fix(z, scene)}
+        return {"contacts": [c.name for c in contacts], "text": text, "z": page.round_z(z, scene)}
 
     places = []
     for (index, _), point, z in zip(parts, middles, poses, strict=True):
@@ -174,7 +174,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None) -> tuple[str, dic
         places.append(describe(chart.formations[index], text, z[None]) | {"wide": True})
     flush = [border for border in chart.borders if border.flush is not None]
     for border, times in zip(flush, time_borders(chart.problem, flush), strict=True):
-        # More than 40 points cannot be told apart by clicks.
+        # Clicks cannot distinguish more than 40 points.
         rows = np.unique(np.linspace(0, len(border.z) - 1, 40).round().astype(int))
         places.append(describe(border.contacts, _describe_border(border, times), border.z[rows]))
     for crossing in chart.crossings:
@@ -186,14 +186,14 @@ def describe_map(chart: FormationMap, plan: Trajectory | None) -> tuple[str, dic
 
 
 def _describe_border(border: Border, times: Array) -> str:
-    """Where a border runs, and what motions along it are possible each way."""
-    ways = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
+    """The range of a border, and possible motions along it in both directions."""
+    directions = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
     possible = []
-    for way, flags, time in ways:
+    for direction, flags, time in directions:
         where = "all along" if flags.all() else "on parts" if flags.any() else "nowhere"
         least = f"least time about {time:.3f} s"
-        told = least if math.isfinite(time) else "no motion from end to end"
-        possible.append(f"{border.along} {way}: {told}, slow motions {where}")
+        text = least if math.isfinite(time) else "no motion from end to end"
+        possible.append(f"{border.along} {direction}: {text}, slow motions {where}")
     (x, phi), (x_end, phi_end) = border.points[0], border.points[-1]
     return (
         f"a border, one freedom, x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
@@ -204,12 +204,12 @@ def _describe_border(border: Border, times: Array) -> str:
 def write_gallery(
     paths: Sequence[str], path: str, progress: Callable[[str], None] = lambda text: None
 ) -> list[str]:
-    """Plan the least time of problems and write them to a page of Markdown.
+    """Write a page of Markdown with time-optimal plans of problems; returns failures by file.
 
-    Figures and movies, which last 2 s, go to a folder beside the page that has its name. Problems
-    without a plan have a row with the reason; returned are these, with the files.
+    Figures and movies, which last 2 s, are in a folder beside the page, with its name. Problems
+    without a plan have a row with the reason.
 
-    InputError if a problem cannot be read, or a file cannot be written; none appears then.
+    InputError if a problem cannot be read, or a file cannot be written; then no file is written.
     """
     problems, folder = [*map(load, paths)], os.path.splitext(path)[0]
     make_folder(os.path.dirname(path) or os.curdir)
@@ -231,8 +231,8 @@ def write_gallery(
             progress(f"{name}: figure and movie")
             stem = os.path.join(folder, name)
             plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
-            how: Any = {"speed": plan.duration / 2.0, "resolution": 50}
-            write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **how)
+            options: Any = {"speed": plan.duration / 2.0, "resolution": 50}
+            write_movie(f"{stem}.gif", plan.problem, plan.trajectory, **options)
             report = verify(plan.problem, plan)
             gap = "" if report.finger_gap is None else report.finger_gap.least
             least = report.least_force

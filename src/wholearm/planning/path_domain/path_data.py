@@ -19,7 +19,7 @@ from ...mechanics.dynamics import apply, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
-from ..robust.robust_rows import COPIES, RobustLimits, find_least, spread_limits, widen
+from ..robust.robust_rows import COPIES, RobustLimits, evaluate_robust, repeat_limits, widen
 from .path_motion import Elements, Grid, PathMotion, Profile
 
 PLACES = 13  # interpolation points where torques of a motion are not those through the knots
@@ -76,7 +76,7 @@ class PhaseData(NamedTuple):
         """The limited values, shape (n, m) [N, N m]."""
         values = apply(places.values, *profile)
         if self.spread is not None:
-            rows, least = self.limits.of(PRESS, CONE), find_least(places.variations, profile)
+            rows, least = self.limits.of(PRESS, CONE), evaluate_robust(places.variations, profile)
             values[:, rows] = np.repeat(least, COPIES, axis=1)
         return values
 
@@ -171,7 +171,7 @@ def prepare(
             )
             for places, each in zip((nodes, checks), at, strict=True)
         )
-        limits = spread_limits(limits)
+        limits = repeat_limits(limits)
     return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, checks, spread)
 
 

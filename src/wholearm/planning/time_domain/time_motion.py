@@ -1,4 +1,4 @@
-"""Motion of a phase in the time domain as a function of time, by integration of its torques."""
+"""Motion of a phase in the time domain as a function of time, integrated from its torques."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ import numpy as np
 from ...common.arrays import Array
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
-from ...mechanics.dynamics import Directions, forward, metric_weights, move_least, split_forces
+from ...mechanics.dynamics import Directions, forward, metric_weights, solve_min_norm, split_forces
 from ...results.torque import TorqueProfile
 from ...results.trajectory import ROLLS, ModeSpan, Samples
-from .stage import Scheme, Stage, StagePoints, blend
+from .stage import Scheme, Stage, StagePoints, bernstein
 
-_NODES = 8  # places per interval at which the equations of motion are solved
+_NODES = 8  # nodes per interval at which the equations of motion are solved
 
 
 class MotionResponse(NamedTuple):
-    """A motion at n instants, and its derivatives by the torques, in which it is affine."""
+    """State and limited quantities at n instants, and derivatives of y and z'' by the torques."""
 
-    z: Array  # z, v (n, 5):
+    z: Array  # z, v (n, 5)
     v: Array
-    y: Array  # (n, m): (c, tau, theta'), of which there are limits
-    y_by_torque: Array  # y_by_torque, a_by_torque (n, m, 2) and (n, 5, 2): slopes of y and z''
-    a_by_torque: Array
+    y: Array  # (n, m): limited quantities (c, tau, theta'), affine in the torques like z''
+    y_by_torque: Array  # (n, m, 2)
+    a_by_torque: Array  # (n, 5, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class StageMotion:
     """One stage as a function of time.
 
-    tau is a polynomial in each interval. z is its integral, projected onto the contacts, and z' the
-    derivative; z'' and the forces follow by forward dynamics. The equations of motion and the
-    contacts hold at any instant.
+    tau is a polynomial in each interval. z is integrated from it and projected onto the contacts,
+    z' is its derivative; z'' and the forces follow by forward dynamics. The equations of motion and
+    the contacts hold at any instant.
     """
 
     formation: Formation
@@ -48,21 +48,21 @@ class StageMotion:
 
     @property
     def duration(self) -> float:
-        """How long the stage lasts [s]."""
+        """Duration of the stage [s]."""
         return self.points.duration
 
     @property
     def breaks(self) -> Array:
-        """When each interval starts, and when the last one ends [s]."""
+        """Start times of the intervals and end of the last [s]."""
         return self.duration * self.points.breaks
 
     @cached_property
     def torque(self) -> TorqueProfile:
-        """Torque from the start of the stage, a polynomial in each interval."""
+        """Torque over the time from the start of the stage, a polynomial in each interval."""
         controls = self.points.tau.shape[1]
-        at = np.linspace(0.0, 1.0, controls)
-        values = blend(at, controls) @ self.points.tau
-        return TorqueProfile(self.breaks, _fit(2 * at - 1, values))
+        grid = np.linspace(0.0, 1.0, controls)
+        values = bernstein(grid, controls) @ self.points.tau
+        return TorqueProfile(self.breaks, _fit(2 * grid - 1, values))
 
     @property
     def defects(self) -> Array:
@@ -71,11 +71,11 @@ class StageMotion:
 
     @cached_property
     def _integrated(self) -> tuple[Array, Array]:
-        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n), and the defects.
+        """Power series of z in x from -1 to 1 over each interval, (K, 5, n), and the defects.
 
-        Accelerations are integrated twice and replaced by forward dynamics (Picard iteration);
-        where it diverges, as B h / J is large, those of least residual are kept. The defect at the
-        end is distributed over the interval.
+        By Picard iteration: accelerations are integrated twice and replaced by forward dynamics.
+        Where it diverges, as B h / J is large, the iterate of least residual counts. The defect at
+        the end is distributed over the interval.
         """
         nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
         z, v = nodes[:, 0], nodes[:, 1]
@@ -87,39 +87,39 @@ class StageMotion:
         a = np.zeros((count, 5, _NODES))
         a[..., : len(self.scheme.points)] = _fit(2 * self.scheme.points - 1, self.points.a)
         weights = np.sqrt(metric_weights(self.formation.scene))[:, None]
-        kept, least = a, np.full((count, 1, 1), np.inf)
-        for _ in range(6):  # times that accelerations are improved. Each gains one to two digits.
+        best, best_residual = a, np.full((count, 1, 1), np.inf)
+        for _ in range(6):  # Picard iterations, each of which gains one to two digits
             velocity = _integrate(a, half, v[:-1])
-            place = _integrate(velocity, half, z[:-1])
-            here, rate = (
+            position = _integrate(velocity, half, z[:-1])
+            positions, rates = (
                 np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
-                for part in (place, velocity)
+                for part in (position, velocity)
             )
-            at = self.formation.evaluate(here, rate)
-            z_ddot, _ = forward(self.formation, at, rate, tau.reshape(-1, 2), self.directions)
+            terms = self.formation.evaluate(positions, rates)
+            z_ddot, _ = forward(self.formation, terms, rates, tau.reshape(-1, 2), self.directions)
             accelerations = _fit(x, z_ddot.reshape(count, _NODES, 5))
             residual = np.abs(weights * (accelerations - a)).max(axis=(1, 2), keepdims=True)
-            nearer = residual < least
-            kept, least = np.where(nearer, a, kept), np.where(nearer, residual, 0.0)
-            a = np.where(nearer, accelerations, kept)
+            improved = residual < best_residual
+            best, best_residual = np.where(improved, a, best), np.where(improved, residual, 0.0)
+            a = np.where(improved, accelerations, best)
         velocity = _integrate(a, half, v[:-1])
-        place = _integrate(velocity, half, z[:-1])
-        miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
-        place[..., :4] += miss[0] * [0.5, 0.75, 0.0, -0.25]
-        place[..., :4] += half * miss[1] * [-0.25, -0.25, 0.25, 0.25]
-        return place, np.concatenate(miss, axis=2).transpose(0, 2, 1)
+        position = _integrate(velocity, half, z[:-1])
+        jump = (z[1:] - position.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
+        position[..., :4] += jump[0] * [0.5, 0.75, 0.0, -0.25]
+        position[..., :4] += half * jump[1] * [-0.25, -0.25, 0.25, 0.25]
+        return position, np.concatenate(jump, axis=2).transpose(0, 2, 1)
 
     def _interpolate(self, t: Array) -> tuple[Array, Array]:
-        """Z and its derivative by the polynomial of each interval."""
+        """Position z and velocity z' at times `t`, (n,), by the polynomials of the intervals."""
         breaks = self.breaks
         piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
         half = np.diff(breaks)[piece] / 2
         x = (t - breaks[piece]) / half - 1
-        places = self._integrated[0][piece]
-        rates = np.polynomial.polynomial.polyder(places, axis=2) / half[:, None, None]
-        powers = x[:, None] ** np.arange(places.shape[2])
-        z = np.einsum("njd,nd->nj", places, powers)
-        return z, np.einsum("njd,nd->nj", rates, powers[:, :-1])
+        polynomials = self._integrated[0][piece]
+        derivatives = np.polynomial.polynomial.polyder(polynomials, axis=2) / half[:, None, None]
+        powers = x[:, None] ** np.arange(polynomials.shape[2])
+        z = np.einsum("njd,nd->nj", polynomials, powers)
+        return z, np.einsum("njd,nd->nj", derivatives, powers[:, :-1])
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the stage, shape (n,) [s]."""
@@ -129,37 +129,37 @@ class StageMotion:
         for _ in range(3):
             kinematics = formation.evaluate(z, v)
             gaps = np.hstack([kinematics.C, formation.evaluate_slip(z) - self.slip])
-            z = z - move_least(kinematics.P, gaps, metric)
+            z = z - solve_min_norm(kinematics.P, gaps, metric)
         kinematics = formation.evaluate(z, v)
-        v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
+        v = v - solve_min_norm(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
         a, c = forward(formation, formation.evaluate(z, v), v, tau, self.directions)
         return Samples(z, v, a, tau, *split_forces(formation, c, self.directions.Xi))
 
     def respond(self, t: Array) -> MotionResponse:
-        """State, forces and accelerations at times `t`, and how these change with torques."""
-        at, formation = self.evaluate(t), self.formation
-        kinematics = formation.evaluate(at.z, at.z_dot)
+        """State and limited quantities at times `t`, (n,), with derivatives by the torques."""
+        samples, formation = self.evaluate(t), self.formation
+        kinematics = formation.evaluate(samples.z, samples.z_dot)
         responses = [
-            forward(formation, kinematics, at.z_dot, at.tau + step, self.directions)
+            forward(formation, kinematics, samples.z_dot, samples.tau + step, self.directions)
             for step in (np.zeros(2), *np.eye(2))
         ]
         a, c = (np.stack(parts, axis=-1) for parts in zip(*responses, strict=True))
-        y = np.hstack([c[..., 0], at.tau, at.z_dot[:, 3:]])
-        by_torque = np.zeros((*y.shape, 2))
-        by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
-        by_torque[:, c.shape[1] : -2] = np.eye(2)
-        return MotionResponse(at.z, at.z_dot, y, by_torque, a[..., 1:] - a[..., :1])
+        y = np.hstack([c[..., 0], samples.tau, samples.z_dot[:, 3:]])
+        y_by_torque = np.zeros((*y.shape, 2))
+        y_by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
+        y_by_torque[:, c.shape[1] : -2] = np.eye(2)
+        return MotionResponse(samples.z, samples.z_dot, y, y_by_torque, a[..., 1:] - a[..., :1])
 
 
 def _fit(x: Array, values: Array) -> Array:
-    """Powers of the polynomials through values, shape (K, n, 5), at `x`, shape (n,): (K, 5, n)."""
-    invert = np.linalg.inv(x[:, None] ** np.arange(len(x)))
-    return np.asarray(np.einsum("dn,knj->kjd", invert, values))
+    """Power series, (K, 5, n), of polynomials through values, (K, n, 5), at `x`, (n,)."""
+    inverse = np.linalg.inv(x[:, None] ** np.arange(len(x)))
+    return np.asarray(np.einsum("dn,knj->kjd", inverse, values))
 
 
 def _integrate(powers: Array, scale: Array, start: Array) -> Array:
-    """Integral from x = -1, times `scale`, of polynomials (K, 5, n), from `start`, (K, 5)."""
+    """`start`, (K, 5), plus `scale` times the integral from x = -1 of polynomials, (K, 5, n)."""
     integral = scale * np.polynomial.polynomial.polyint(powers, lbnd=-1, axis=2)
     integral[..., 0] += start
     return np.asarray(integral)
@@ -173,12 +173,12 @@ class TimeMotion:
 
     @property
     def duration(self) -> float:
-        """How long the phase lasts [s]."""
+        """Duration of the phase [s]."""
         return float(self.starts[-1])
 
     @cached_property
     def starts(self) -> Array:
-        """When each stage starts, and when the last one ends [s]."""
+        """Start times of the stages and end of the last [s]."""
         return np.concatenate([[0.0], np.cumsum([stage.duration for stage in self.stages])])
 
     @property
@@ -188,12 +188,12 @@ class TimeMotion:
 
     @property
     def torque(self) -> TorqueProfile:
-        """Torque from the start of the phase."""
+        """Torque over the time from the start of the phase."""
         return TorqueProfile.chain([stage.torque for stage in self.stages])
 
     @property
     def modes(self) -> tuple[ModeSpan, ...]:
-        """Contact modes of the stages with their times."""
+        """Contact modes of the stages with their times in the phase."""
         spans = []
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             signs = ["+" if sign > 0 else "-" for sign in np.concatenate(stage.directions)]
@@ -224,15 +224,15 @@ def make_phase_motions(stages: Sequence[Stage], scheme: Scheme) -> list[TimeMoti
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
     """The stages' guesses as functions of time."""
     motions: list[StageMotion] = []
-    kept: dict[Contact, float] = {}
+    slips: dict[Contact, float] = {}
     phase = -1
     for stage in stages:
         formation = stage.formation
         slip = formation.evaluate_slip(stage.guess.nodes[0, :1])[0]
         rolling = [formation.contacts[row] for row in formation.rolling_rows]
-        # Contacts that have rolled before in this phase keep their coordinate.
-        before = kept if stage.phase == phase else {}
-        kept = {c: before.get(c, s) for c, s in zip(rolling, slip.tolist(), strict=True)}
-        slip, phase = np.array([kept[c] for c in rolling]), stage.phase
+        # Contacts that rolled in the previous stage of this phase keep their coordinate.
+        previous = slips if stage.phase == phase else {}
+        slips = {c: previous.get(c, s) for c, s in zip(rolling, slip.tolist(), strict=True)}
+        slip, phase = np.array([slips[c] for c in rolling]), stage.phase
         motions.append(StageMotion(formation, stage.directions, scheme, stage.guess, slip))
     return motions

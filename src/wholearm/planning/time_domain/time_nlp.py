@@ -51,14 +51,14 @@ from ..nlp import (
     share,
 )
 from ..options import Objective
-from .stage import LimitMisses, Scheme, Stage, StagePoints, blend, make_scheme
+from .stage import LimitViolations, Scheme, Stage, StagePoints, bernstein, make_scheme
 
 SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
 
 
 @dataclass(frozen=True, eq=False)
 class StageLayout:
-    """Indices of one stage's unknowns; those of `StagePoints` have the shapes there."""
+    """Indices of one stage's unknowns; fields of `StagePoints` have the shapes given there."""
 
     h: Indices
     nodes: Indices
@@ -69,22 +69,22 @@ class StageLayout:
     tau: Indices
     impulses: Indices  # of the impact that leads to the next stage, if one does
     margin: Indices  # (K + 1, 1) or (K + 1, 0): copies of a margin or relaxation at the nodes
-    short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
-    begin: Indices  # begin, finish: c_n, c_t and friction of the joints at rest at both ends, of
-    finish: Indices  # continuous torques
+    shortfalls: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
+    start_forces: Indices  # start_forces, end_forces: c_n, c_t and joint friction at rest at both
+    end_forces: Indices  # ends, with continuous torques
 
     @property
     def stop(self) -> int:
-        """Past its last unknown."""
+        """One past the index of the last unknown."""
         return 1 + max(int(part.max(initial=-1)) for part in vars(self).values())
 
 
 def lay_out(
-    stages: Sequence[Stage], scheme: Scheme, target: Target, held: bool = False
+    stages: Sequence[Stage], scheme: Scheme, target: Target, with_statics: bool = False
 ) -> list[StageLayout]:
-    """Indices of the unknowns of successive stages; `held`: torques hold what rests."""
+    """Indices of the unknowns of successive stages, `with_statics` also of forces at rest."""
     layouts: list[StageLayout] = []
-    stop, d, m, with_margin = 0, scheme.degree, scheme.controls, int(target.chained)
+    stop, d, m, n_margin = 0, scheme.degree, scheme.controls, int(target.has_margin)
 
     def take(*shape: int) -> Indices:
         nonlocal stop
@@ -96,24 +96,24 @@ def lay_out(
         K, formation = stage.intervals, stage.formation
         # In elastic mode every limit but those of speeds has a shortfall in each interval.
         soft = make_limits(formation, target.epsilon).without(SPEED).limits
-        short = len(soft) * (target.objective is Objective.ELASTIC)
-        width, end = d * (15 + formation.n_constraints), 10 * (not scheme.ends)
-        begins = held and (not k or stages[k - 1].rests)
-        begin = take((2 * formation.n_contacts + 2) * begins)
-        first, first_margin = take(10), take(with_margin)
-        interval = Columns(h=1, tau=2 * m, points=width, end=end, short=short, m=with_margin)
+        n_short = len(soft) * (target.objective is Objective.ELASTIC)
+        width, end = d * (15 + formation.n_constraints), 10 * (not scheme.has_end)
+        starts_at_rest = with_statics and (not k or stages[k - 1].ends_at_rest)
+        start_forces = take((2 * formation.n_contacts + 2) * starts_at_rest)
+        first, first_margin = take(10), take(n_margin)
+        interval = Columns(h=1, tau=2 * m, points=width, end=end, short=n_short, margin=n_margin)
         table = take(K, interval.count)
-        at = {name: table[:, part] for name, part in interval.slices.items()}
-        of_points = at["points"].reshape(K, d, -1)
-        z, v, a, forces = np.split(of_points, [5, 10, 15], axis=2)
-        ends = of_points[:, -1, :10] if scheme.ends else at["end"]
-        jumps = stage.ends_in_impact and k + 1 < len(stages)
-        nodes, tau = np.vstack([first, ends]).reshape(K + 1, 2, 5), at["tau"].reshape(K, m, 2)
-        impulses = take(stages[k + 1].formation.n_constraints if jumps else 0)
-        margin = np.vstack([first_margin, at["m"]])
-        finish = take((2 * stage.ending.n_contacts + 2) * (held and stage.rests))
-        points = at["h"][:, 0], nodes, z, v, a, forces, tau, impulses
-        layouts.append(StageLayout(*points, margin, at["short"], begin, finish))
+        blocks = {name: table[:, part] for name, part in interval.slices.items()}
+        by_point = blocks["points"].reshape(K, d, -1)
+        z, v, a, forces = np.split(by_point, [5, 10, 15], axis=2)
+        ends = by_point[:, -1, :10] if scheme.has_end else blocks["end"]
+        has_impact = stage.ends_in_impact and k + 1 < len(stages)
+        nodes, tau = np.vstack([first, ends]).reshape(K + 1, 2, 5), blocks["tau"].reshape(K, m, 2)
+        impulses = take(stages[k + 1].formation.n_constraints if has_impact else 0)
+        margin = np.vstack([first_margin, blocks["margin"]])
+        end_forces = take((2 * stage.ending.n_contacts + 2) * (with_statics and stage.ends_at_rest))
+        points = blocks["h"][:, 0], nodes, z, v, a, forces, tau, impulses
+        layouts.append(StageLayout(*points, margin, blocks["short"], start_forces, end_forces))
     return layouts
 
 
@@ -123,15 +123,15 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
     for part, layout in zip(points, layouts, strict=True):
         for name, table in part._asdict().items():
             x[getattr(layout, name)] = table
-        x[layout.short], x[layout.margin] = 1.0, margin
-        ends = (layout.begin, part.forces[0, 0]), (layout.finish, part.forces[-1, -1])
-        for held, forces in ends:
-            x[held[: len(forces)]] = forces[: len(held)]
+        x[layout.shortfalls], x[layout.margin] = 1.0, margin
+        statics = (layout.start_forces, part.forces[0, 0]), (layout.end_forces, part.forces[-1, -1])
+        for indices, forces in statics:
+            x[indices[: len(forces)]] = forces[: len(indices)]
     return x
 
 
 def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
-    """What `pack` put together."""
+    """Stage points of a vector of unknowns, the inverse of `pack`."""
     names = StagePoints._fields
     return [StagePoints(*(x[getattr(layout, name)] for name in names)) for layout in layouts]
 
@@ -145,27 +145,27 @@ class Target(NamedTuple):
     relaxation: Parameter | None = None  # the relaxed limit, for `relax`
 
     @property
-    def chained(self) -> bool:
-        """Whether nodes have one more unknown, all of them copies: a margin or a relaxation."""
+    def has_margin(self) -> bool:
+        """Whether nodes have a further unknown, equal at all: a margin or a relaxation."""
         return self.objective in (Objective.MARGIN, Objective.RELAX)
 
 
 class LimitPart(NamedTuple):
-    """Where one side of the limits of a stage is kept: by rows, or bounds of unknowns."""
+    """How one side of the limits of a stage is imposed: as rows or as bounds of unknowns."""
 
     side: int
     on_rows: bool
-    indices: Indices  # (K, n): of the rows, whose lower bounds these are, or of the unknowns
+    indices: Indices  # (K, n): of rows, by their lower bounds, or of unknowns
 
 
 @dataclass(frozen=True, eq=False)
 class StageRows:
     """Rows of one stage, interval by interval."""
 
-    states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
+    states: Indices  # (K, 2, n, f): collocation of z and z', n rows of the scheme along `bases`
     bases: Array  # (K, 5, f): tangent space of each interval
     balance: Indices  # (K, d, 5): equations of motion at the points
-    senses: Indices  # (K, d, n_rubbing): sliding directions of contacts with friction there
+    slip_rates: Indices  # (K, d, n_rubbing): sliding directions of contacts with friction
     limits: LimitSet
     parts: list[LimitPart]
     monitor_rows: Indices  # (K, d, m): limits of the formation
@@ -181,60 +181,68 @@ class TimeNLP:
     rows: NlpRows
     rows_of: list[StageRows]
     duration_row: int  # row of the whole duration with a margin or a relaxation; otherwise -1
+    scaling: float  # of the objective for Ipopt, whose tolerances are for values of about 1
 
     @cached_property
     def solver(self) -> Expression:
-        """Ipopt, to start from a solution."""
+        """Ipopt for a warm start."""
         return self.make_solver(1e-6)
 
     def make_solver(self, push: float, **options: Any) -> Expression:
-        """Ipopt, with this distance of the first point from its bounds, and other options."""
+        """Ipopt with `push`, the initial distance from the bounds, and further options."""
         nlp, derivatives = self.assembled
-        most = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
-        return build_solver("time_nlp", nlp, push, derivatives, **most, **options)
+        limits = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
+        options |= {**limits, "obj_scaling_factor": self.scaling}
+        return build_solver("time_nlp", nlp, push, derivatives, **options)
 
 
 def build_time_nlp(
     stages: Sequence[Stage], scheme: Scheme, target: Target, max_iter: int
 ) -> TimeNLP:
-    """Build the NLP of successive stages that end at rest; its parameters are prices of the end."""
-    started = time.perf_counter()
-    # Regularized friction holds nothing at rest.
-    held = stages[0].formation.scene.has_slow_motors and not stages[0].onset
-    layouts = lay_out(stages, scheme, target, held)
+    """NLP of successive stages that end at rest; its parameters are the prices of the end."""
+    start_time = time.perf_counter()
+    # Regularized friction is zero at rest.
+    with_statics = stages[0].formation.scene.has_slow_motors and not stages[0].smoothing
+    layouts = lay_out(stages, scheme, target, with_statics)
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
-    start = stages[0].guess.nodes[0].ravel()
-    rows.add_entries(rows.linear(10, low=start, high=start), layouts[0].nodes[0].ravel(), 1.0)
+    state = stages[0].guess.nodes[0].ravel()
+    rows.add_entries(rows.linear(10, low=state, high=state), layouts[0].nodes[0].ravel(), 1.0)
     rows_of, controls = [], scheme.controls
-    # Weight of time: a little, against violations.
+    # Weight of the duration, small beside violations.
     of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
+    # Without a cost of second differences torques ring, if their squares cost little. Case: least
+    # effort of the shipped square at a tenth of its size, where the weight of time is 4e5.
+    squares, weight = 0.0, 1.0
+    if target.objective is Objective.EFFORT:
+        squares, weight = 1.0, target.time_weight
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
         kernel, columns = effort_kernel(controls), _list_torques(layout)
-        if target.objective is Objective.EFFORT:
+        if squares:
             rows.add_copies(kernel, columns, cost=True)
-        elif controls > 2:
-            weights = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # else they ring
-            rows.add_copies(bend_kernel(controls), columns, weights, cost=True)
+        curvature = 1e-2 * weight * stage.formation.scene.torque_limit**-2.0 - 0.1 * squares
+        if controls > 2 and (curvature > 0).any():
+            weights = {"weight": np.maximum(curvature, 0.0)}
+            rows.add_copies(curvature_kernel(controls), columns, weights, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
-        cost[layout.short] = 1 / stage.intervals
-    duration_row, last, (end_z, end_v) = -1, stages[-1], layouts[-1].nodes[-1]
+        cost[layout.shortfalls] = 1 / stage.intervals
+    duration_row, last_stage, (end_z, end_v) = -1, stages[-1], layouts[-1].nodes[-1]
     if stages[0].periods:
         add_periods(rows, stages, layouts)
-    if held:
+    if with_statics:
         hold_ends(rows, stages, layouts, scheme, target.epsilon)
-    if target.chained:
+    if target.has_margin:
         cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
         rows.add_entries(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         duration_row = int(total[0])
-    N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
+    N = tangent_basis(last_stage.formation, last_stage.guess.nodes[-1, 0])
     rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
-    built = rows.assemble(cost, end_z)
-    book(SolverStatistics(build_time=time.perf_counter() - started))
-    return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
+    nlp = rows.assemble(cost, end_z)
+    book(SolverStatistics(build_time=time.perf_counter() - start_time))
+    return TimeNLP(nlp, max_iter, layouts, rows, rows_of, duration_row, 1 / (squares + weight))
 
 
 def _list_torques(layout: StageLayout) -> dict[str, Indices]:
@@ -245,7 +253,7 @@ def _list_torques(layout: StageLayout) -> dict[str, Indices]:
 def add_stage(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
 ) -> StageRows:
-    """Add the constraints of a stage."""
+    """Add the constraints of a stage, and return their rows."""
     formation, guess, (K, d) = stage.formation, stage.guess, layout.z.shape[:2]
     places, node, ends = guess.places(scheme.points), layout.nodes[:-1], layout.nodes[1:]
     rows.add_equal(layout.margin[1:], layout.margin[:-1])
@@ -253,12 +261,12 @@ def add_stage(
     # Collocation of z and z' along the tangent space.
     bases = np.array([tangent_basis(formation, z) for z in guess.z[:, d // 2]])
     f, pairs = bases.shape[2], ((layout.z, layout.v), (layout.v, layout.a))
-    states = np.zeros((K, 2, len(scheme.rungs), f), dtype=np.int64)
+    states = np.zeros((K, 2, len(scheme.weights), f), dtype=np.int64)
     for k, (state, rate) in enumerate(pairs):
         columns = {
             "start": node[:, k],
             "points": state.reshape(K, -1),
-            "end": ends[:, k, : 5 * (not scheme.ends)],
+            "end": ends[:, k, : 5 * (not scheme.has_end)],
             "rates": rate.reshape(K, -1),
             "h": layout.h[:, None],
         }
@@ -266,118 +274,118 @@ def add_stage(
         states[:, k] = rows.add_copies(kernel, columns, {"N": N}).reshape(states[:, k].shape)
     if not stage.periods:
         # Constant ratios of intervals, scaled like other rows.
-        shares, ratio_rows = K * guess.fractions, rows.linear(K - 1)
-        rows.add_entries(ratio_rows, layout.h[:-1], shares[1:])
-        rows.add_entries(ratio_rows, layout.h[1:], -shares[:-1])
+        weights, ratio_rows = K * guess.fractions, rows.linear(K - 1)
+        rows.add_entries(ratio_rows, layout.h[:-1], weights[1:])
+        rows.add_entries(ratio_rows, layout.h[1:], -weights[:-1])
 
     # Equations of motion, contacts and sliding directions at the points.
-    homotopy, first = stage.onset > 0, node[:, 0, : 5 * bool(formation.rolling)]
-    kernel, least = point_kernel(formation, scheme.controls, homotopy), least_senses(stage, places)
+    homotopy, z_start = stage.smoothing > 0, node[:, 0, : 5 * bool(formation.rolling)]
+    kernel, least = point_kernel(formation, scheme.controls, homotopy), least_rates(stage, places)
     columns = {"z": layout.z, "v": layout.v, "a": layout.a, "forces": layout.forces}
-    columns |= {"tau": _list_torques(layout)["tau"][:, None], "first": first[:, None]}
+    columns |= {"tau": _list_torques(layout)["tau"][:, None], "z_start": z_start[:, None]}
     parameters = stage.directions._asdict() | {
-        "shares": blend(scheme.points, scheme.controls),
+        "basis": bernstein(scheme.points, scheme.controls),
         "least": np.maximum(least[..., : formation.n_contacts], 0.0),
-        "onset": np.full(1 * homotopy, stage.onset),
+        "smoothing": np.full(1 * homotopy, stage.smoothing),
     }
-    still, balance, senses = set[int](), kernel.y["balance"], kernel.y["senses"]
-    if scheme.ends:
-        still = find_still(stage, last)
+    zero_rates, balance, slip_rates = set[int](), kernel.y["balance"], kernel.y["slip_rates"]
+    if scheme.has_end:
+        zero_rates = find_zero_rates(stage, last)
     low, high = np.zeros((K, d, kernel.y.count)), np.zeros(kernel.y.count)
-    high[senses] = np.inf
-    low[..., senses] = -np.inf if homotopy else 0.0
-    low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
+    high[slip_rates] = np.inf
+    low[..., slip_rates] = -np.inf if homotopy else 0.0
+    low[-1, -1, slip_rates][[k in zero_rates for k in formation.rubbing_rows]] = -np.inf
     points = rows.add_copies(kernel, columns, parameters, low=low, high=high)
-    if not scheme.ends:
-        columns = {"z": ends[:, 0], "v": ends[:, 1], "first": first}
+    if not scheme.has_end:
+        columns = {"z": ends[:, 0], "v": ends[:, 1], "z_start": z_start}
         rows.add_copies(end_kernel(formation), columns)
 
     # Limits of the formation that are not negative; that of the end's contact is zero there.
-    goal = None if stage.until is None else stage.until.contact
+    end_contact = None if stage.until is None else stage.until.contact
     low = stage.list_clearances(places.ravel(), after=1 / 3).reshape(K, d, -1)
-    if scheme.ends:
-        low[-1, -1, [formation.limits[k].gains(goal) for k in stage.monitored]] = -np.inf
+    if scheme.has_end:
+        low[-1, -1, [formation.limits[k].gains(end_contact) for k in stage.monitored]] = -np.inf
     kernel = monitor_kernel(formation, stage.monitored)
     monitor_rows = rows.add_copies(kernel, {"z": layout.z}, low=low, high=np.inf)
-    slow = formation.scene.has_slow_motors
+    rate_limited = formation.scene.has_slow_motors
     if stage.opens and stage.opening is not None:
         gained = [formation.limits[k].gained for k in stage.released]
         # With continuous torques a released contact has no acceleration at first.
-        opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
+        opening = stage.opening * (scheme.points[:, None] if rate_limited else 1.0)
         for contact in [c for c in gained if c is not None]:
             columns = {"z": layout.z[0], "v": layout.v[0], "a": layout.a[0]}
             rows.add_copies(opening_kernel(formation, contact), columns, low=opening, high=np.inf)
 
     # The end.
     until, (end_z, end_v) = stage.until, layout.nodes[-1]
-    if last and stage.stop is not None:
-        until, pinned = None, np.flatnonzero(np.isfinite(stage.stop))
-        there = rows.linear(len(pinned), low=stage.stop[pinned], high=stage.stop[pinned])
-        rows.add_entries(there, end_z[pinned], 1.0)
-    turns, gained_softly = _list_free_turns(stage), stage.gained
+    if last and stage.end_pose is not None:
+        until, pinned = None, np.flatnonzero(np.isfinite(stage.end_pose))
+        end_rows = rows.linear(len(pinned), low=stage.end_pose[pinned], high=stage.end_pose[pinned])
+        rows.add_entries(end_rows, end_z[pinned], 1.0)
+    reversals, next_formation = _list_independent_reversals(stage), stage.next_formation
     if stops(stage):
-        turns, gained_softly = (), None
+        reversals, next_formation = (), None
         N = tangent_basis(formation, guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
     row = None if until is None else find_range_end(formation, until, guess.nodes[-1, 0])
-    kernel = goal_kernel(formation, until, row, turns, gained_softly)
+    kernel = goal_kernel(formation, until, row, reversals, next_formation)
     rows.add_copies(kernel, {"z": end_z, "v": end_v})
-    if stage.lands and until is not None and until.contact is not None:
-        alone, scene = Formation(formation.scene, (until.contact,)), formation.scene
+    if stage.ends_in_range and until is not None and until.contact is not None:
+        single, scene = Formation(formation.scene, (until.contact,)), formation.scene
         ranges = tuple(range(len(build_limits(until.contact, scene))))
-        rows.add_copies(monitor_kernel(alone, ranges), {"z": end_z}, high=np.inf)
+        rows.add_copies(monitor_kernel(single, ranges), {"z": end_z}, high=np.inf)
     limits, parts = add_limits(rows, stage, layout, scheme, target)
-    if slow:
+    if rate_limited:
         add_motors(rows, stage, layout, scheme)
-    of_points = points[..., balance], points[..., senses]
-    return StageRows(states, bases, *of_points, limits, parts, monitor_rows)
+    balance_rows, slip_rows = points[..., balance], points[..., slip_rates]
+    return StageRows(states, bases, balance_rows, slip_rows, limits, parts, monitor_rows)
 
 
-def _list_free_turns(stage: Stage) -> tuple[int, ...]:
-    """One of each set of rows that reverse together: dependent equations spoil the solver's steps.
+def _list_independent_reversals(stage: Stage) -> tuple[int, ...]:
+    """Rows whose rates reverse, one of each dependent set: dependent equations spoil Newton steps.
 
-    Rows are tied, or vanish at the same place of a curve, as on the square by symmetry.
+    Dependent rows are tied, or vanish at the same place of a curve, as on the square by symmetry.
     """
-    tied, free, end = set[int](), list[int](), stage.guess.nodes[-1, 0]
-    still = find_vanishing(stage.formation, end)
-    for row in stage.turns:
+    tied, independent, end = set[int](), list[int](), stage.guess.nodes[-1, 0]
+    zeros = find_vanishing(stage.formation, end)
+    for row in stage.reversals:
         if row not in tied:
-            free.append(row)
-            tied.update(find_tied(stage.formation, end, row), still if row in still else ())
-    return tuple(free)
+            independent.append(row)
+            tied.update(find_tied(stage.formation, end, row), zeros if row in zeros else ())
+    return tuple(independent)
 
 
 def stops(stage: Stage) -> bool:
-    """Whether everything stops at the end of a stage, as independent rates reverse there.
+    """Whether all rates are zero at the end of a stage, as enough independent rates reverse there.
 
-    With one degree of freedom these are two, as one alone may have a zero.
+    As many as degrees of freedom. With one they are two, since a single rate may have a zero.
     """
-    return len(_list_free_turns(stage)) >= max(2, 5 - stage.formation.n_constraints)
+    return len(_list_independent_reversals(stage)) >= max(2, 5 - stage.formation.n_constraints)
 
 
-def least_senses(stage: Stage, places: Array) -> Array:
-    """Least rates of (contacts, joints) at `places`, shares of a stage's duration.
+def least_rates(stage: Stage, places: Array) -> Array:
+    """Least rates of (contacts, joints) at `places`, fractions of a stage's duration.
 
-    In their shape and one more axis. Zero at both ends, for the second contact of a vertex, and
-    with one degree of freedom, where friction cannot hold one contact alone; none in the friction
+    Shape of `places` and one more axis. Zero at both ends, for the second contact of a vertex, and
+    with one degree of freedom, where friction cannot hold one contact alone. -inf in the friction
     homotopy.
     """
-    contacts, free = stage.formation.contacts, stage.formation.n_constraints < 4
-    least = SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places))[..., None]
-    if stage.onset:
+    contacts, mobile = stage.formation.contacts, stage.formation.n_constraints < 4
+    least = SLIDING * mobile * np.minimum(1.0, 8 * np.minimum(places, 1 - places))[..., None]
+    if stage.smoothing:
         least = np.full(least.shape, -np.inf)
     vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
-    again = [vertex is not None and vertex in vertices[:k] for k, vertex in enumerate(vertices)]
-    return np.asarray(np.where([*again, False, False], np.minimum(least, 0.0), least))
+    repeated = [vertex is not None and vertex in vertices[:k] for k, vertex in enumerate(vertices)]
+    return np.asarray(np.where([*repeated, False, False], np.minimum(least, 0.0), least))
 
 
-def find_still(stage: Stage, last: bool) -> set[int]:
-    """Rows of (contacts, joints) that stand still at the end of a stage."""
+def find_zero_rates(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) whose rate is zero at the end of a stage."""
     if last or stops(stage):
         return set(range(stage.formation.n_contacts + 2))
-    coming = stage.gained.rolling if stage.gained else ()
-    rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
-    return {*stage.turns, *rolls}
+    rolling = stage.next_formation.rolling if stage.next_formation else ()
+    sticking = [k for k, c in enumerate(stage.formation.contacts) if c in rolling]
+    return {*stage.reversals, *sticking}
 
 
 def join_stages(
@@ -386,90 +394,90 @@ def join_stages(
     layouts: tuple[StageLayout, StageLayout],
     scheme: Scheme,
 ) -> None:
-    """Continuous position and velocity from one stage to the next, or an impact."""
-    (stage, coming), (layout, following) = pair, layouts
-    last, first = layout.nodes[-1], following.nodes[0]
-    if stage.formation.scene.has_slow_motors and not stage.rests:
+    """Add rows for continuous position and velocity between stages, or for an impact."""
+    (stage, next_stage), (layout, next_layout) = pair, layouts
+    last, first = layout.nodes[-1], next_layout.nodes[0]
+    if stage.formation.scene.has_slow_motors and not stage.ends_at_rest:
         join_motors(rows, stage, layouts, scheme)
-    same = slice(1 if stage.ends_in_impact else 2)
-    rows.add_equal(first[same].ravel(), last[same].ravel())
-    rows.add_equal(following.margin[0], layout.margin[-1])
+    continuous = slice(1 if stage.ends_in_impact else 2)
+    rows.add_equal(first[continuous].ravel(), last[continuous].ravel())
+    rows.add_equal(next_layout.margin[0], layout.margin[-1])
     if stage.ends_in_impact:
-        kernel = impact_kernel(stage.formation, coming.formation)
+        kernel = impact_kernel(stage.formation, next_stage.formation)
         high = np.zeros(kernel.y.count)
-        high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
+        high[kernel.y["openings"]] = high[kernel.y["cones"]] = np.inf
         x = {"after": first[1], "before": last[1], "z": last[0], "impulses": layout.impulses}
-        rows.add_copies(kernel, x, {"Xi": coming.directions.Xi}, high=high)
+        rows.add_copies(kernel, x, {"Xi": next_stage.directions.Xi}, high=high)
 
 
 def add_limits(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
 ) -> tuple[LimitSet, list[LimitPart]]:
-    """Add rows for the limits of a stage; also the limits, and where their sides are kept."""
+    """Add rows for the limits of a stage; return the limits and how their sides are imposed."""
     limits, goal = make_limits(stage.formation, target.epsilon), target.objective
-    presses, weights = limits.of(PRESS), np.zeros(len(limits.low))
+    normal, weights = limits.of(PRESS), np.zeros(len(limits.low))
     if goal is Objective.MARGIN:
-        weights[presses] = -1.0
+        weights[normal] = -1.0
     elif goal is Objective.ELASTIC:
         weights[limits.of(*{limit.kind for limit in limits.without(SPEED).limits})] = 1.0
     elif target.relaxation is not None:
         weights = limits.weigh(target.relaxation.key)
 
-    def give(added: Indices, row: int) -> None:
+    def add_slack(limit_rows: Indices, row: int) -> None:
         """Add the slack of a limit's row, if it has one."""
         if weights[row]:
-            short = goal is Objective.ELASTIC
-            slack = layout.short[:, limits.owners[row]] if short else layout.margin[:-1, 0]
-            rows.add_entries(added, slack[:, None], weights[row])
+            elastic = goal is Objective.ELASTIC
+            slack = layout.shortfalls[:, limits.owners[row]] if elastic else layout.margin[:-1, 0]
+            rows.add_entries(limit_rows, slack[:, None], weights[row])
 
     # Normal forces by the polynomials through the points.
-    soft = bool(weights[presses].any())
-    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
+    soft = bool(weights[normal].any())
+    places = np.zeros(1) if scheme.has_end else np.array([0.0, 1.0])
     if stage.formation.scene.has_slow_motors:
         # Their minima are inside intervals.
         places = np.append(places, [0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
     if soft:
         places = np.append(places, scheme.points)
-    c_n = layout.forces[:, :, limits.rows[presses].argmax(axis=1)]
-    pressed = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
-    for i, shares in enumerate(scheme.interpolate(places)):
-        for j in np.flatnonzero(np.abs(shares) > 1e-12):
-            rows.add_entries(pressed[:, i], c_n[:, j], shares[j])
+    c_n = layout.forces[:, :, limits.rows[normal].argmax(axis=1)]
+    normal_rows = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
+    for i, basis in enumerate(scheme.interpolate(places)):
+        for j in np.flatnonzero(np.abs(basis) > 1e-12):
+            rows.add_entries(normal_rows[:, i], c_n[:, j], basis[j])
     side_rows, signs, _ = limits.sides
     parts = list[LimitPart]()
-    for k, row in enumerate(presses):
-        give(pressed[..., k], row)
+    for k, row in enumerate(normal):
+        add_slack(normal_rows[..., k], row)
         side = int(np.flatnonzero(side_rows == row)[0])
-        parts.append(LimitPart(side, True, pressed[..., k]))
+        parts.append(LimitPart(side, True, normal_rows[..., k]))
         if not soft:  # with rows at the points the forces themselves have no bounds
             parts.append(LimitPart(side, False, c_n[..., k]))
 
     # Rows of y at the points, and bounds of one torque or joint speed alone.
     column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
-    alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
-    single = np.where(alone, column - n_forces, -1)[side_rows]
-    others = np.flatnonzero(~np.isin(side_rows, presses) & (single < 0))
-    added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
-    for k, side in enumerate(others.tolist()):
-        of_y = np.split(signs[side] * limits.rows[side_rows[side]], [n_forces, n_forces + 2])
-        for unknowns, of_them in ((layout.forces, of_y[0]), (layout.v[..., 3:], of_y[2])):
-            for n in np.flatnonzero(of_them):
-                rows.add_entries(added[..., k], unknowns[..., n], of_them[n])
-        for n in np.flatnonzero(of_y[1]):
-            for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
-                rows.add_entries(added[..., k], layout.tau[:, None, i, n], of_y[1][n] * shares)
-        give(added[..., k], side_rows[side])
+    single_column = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
+    bounded = np.where(single_column, column - n_forces, -1)[side_rows]
+    general = np.flatnonzero(~np.isin(side_rows, normal) & (bounded < 0))
+    added = rows.linear(*layout.z.shape[:2], len(general), high=np.inf)
+    for k, side in enumerate(general.tolist()):
+        blocks = np.split(signs[side] * limits.rows[side_rows[side]], [n_forces, n_forces + 2])
+        for unknowns, block in ((layout.forces, blocks[0]), (layout.v[..., 3:], blocks[2])):
+            for n in np.flatnonzero(block):
+                rows.add_entries(added[..., k], unknowns[..., n], block[n])
+        for n in np.flatnonzero(blocks[1]):
+            for i, basis in enumerate(bernstein(scheme.points, scheme.controls).T):
+                rows.add_entries(added[..., k], layout.tau[:, None, i, n], blocks[1][n] * basis)
+        add_slack(added[..., k], side_rows[side])
         parts.append(LimitPart(side, True, added[..., k]))
-    for side in np.flatnonzero(single >= 0).tolist():
-        k, softened = int(single[side]), bool(weights[side_rows[side]])
+    for side in np.flatnonzero(bounded >= 0).tolist():
+        k, soft_side = int(bounded[side]), bool(weights[side_rows[side]])
         # Control points of a torque, or speeds at the points.
         indices = layout.tau[..., k] if k < 2 else layout.v[..., 1 + k]
-        if softened:
-            added_row = rows.linear(*indices.shape, high=np.inf)
-            rows.add_entries(added_row, indices, signs[side])
-            give(added_row, side_rows[side])
-            indices = added_row
-        parts.append(LimitPart(side, softened, indices))
+        if soft_side:
+            soft_rows = rows.linear(*indices.shape, high=np.inf)
+            rows.add_entries(soft_rows, indices, signs[side])
+            add_slack(soft_rows, side_rows[side])
+            indices = soft_rows
+        parts.append(LimitPart(side, soft_side, indices))
     return limits, parts
 
 
@@ -481,8 +489,8 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
     limited = np.flatnonzero(np.isfinite(scene.torque_rate_limit))
     rates = rows.linear(K, n, len(limited), 2, high=np.inf)
     limit, signs = scene.torque_limit[limited, None], np.array([1.0, -1.0])
-    most = scene.torque_rate_limit[limited, None] / limit
-    rows.add_entries(rates, layout.h[:, None, None, None], most)
+    ratio = scene.torque_rate_limit[limited, None] / limit
+    rows.add_entries(rates, layout.h[:, None, None, None], ratio)
     rows.add_entries(rates, tau[:, 1:, limited, None], -signs * n / limit)
     rows.add_entries(rates, tau[:, :-1, limited, None], signs * n / limit)
     lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
@@ -495,23 +503,23 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
 def join_motors(
     rows: NlpRows, stage: Stage, layouts: tuple[StageLayout, StageLayout], scheme: Scheme
 ) -> None:
-    """Continuous torques, forces and accelerations from a stage to the next."""
-    layout, coming = layouts
+    """Add rows for continuous torques, forces and accelerations between stages."""
+    layout, next_layout = layouts
     formation = stage.formation
     scale = 1 / formation.scene.torque_limit
-    rows.add_equal(coming.tau[0, 0], layout.tau[-1, -1], scale)
-    shares = scheme.interpolate(np.ones(1))[0]
-    for fading, slips in stage.fading:
-        equation, share = rows.linear(1), float(formation.friction[fading]) if slips else 1.0
-        rows.add_entries(equation, layout.forces[-1, :, fading], share * shares)
-        if slips:
-            tangential = formation.n_contacts + formation.rolling_rows.index(fading)
-            rows.add_entries(equation, layout.forces[-1, :, tangential], slips * shares)
-    if scheme.ends and stage.gained is not None:
-        for contact in stage.gained.contacts:
+    rows.add_equal(next_layout.tau[0, 0], layout.tau[-1, -1], scale)
+    weights = scheme.interpolate(np.ones(1))[0]
+    for row, sign in stage.ending_constraints:
+        equation, factor = rows.linear(1), float(formation.friction[row]) if sign else 1.0
+        rows.add_entries(equation, layout.forces[-1, :, row], factor * weights)
+        if sign:
+            tangential = formation.n_contacts + formation.rolling_rows.index(row)
+            rows.add_entries(equation, layout.forces[-1, :, tangential], sign * weights)
+    if scheme.has_end and stage.next_formation is not None:
+        for contact in stage.next_formation.contacts:
             if contact not in formation.contacts:
-                z, v, a = (part[-1, -1] for part in (layout.z, layout.v, layout.a))
-                rows.add_copies(opening_kernel(stage.gained, contact), {"z": z, "v": v, "a": a})
+                columns = {name: getattr(layout, name)[-1, -1] for name in ("z", "v", "a")}
+                rows.add_copies(opening_kernel(stage.next_formation, contact), columns)
 
 
 def hold_ends(
@@ -521,20 +529,20 @@ def hold_ends(
     scheme: Scheme,
     epsilon: float,
 ) -> None:
-    """Torques hold the object at rest at the ends of a motion, and where it stops between phases.
+    """Add static balance at both ends of a motion, and where it stops between phases.
 
-    It begins without acceleration, on the verge of its directions: friction may not step. So it
-    ends with one degree of freedom, as along its curve. With more it may stop with an acceleration,
-    which the contact that is gained and friction at rest take up.
+    The motion begins without acceleration and with full friction against its directions, since
+    friction may not step. With one degree of freedom it ends so, too, as along its curve. With more
+    it may stop with an acceleration, balanced by the gained contact and friction at rest.
     """
     ends = list[tuple[Stage, Formation, Indices, Indices, Indices]]()
     for stage, layout in zip(stages, layouts, strict=True):
         z, tau = layout.nodes[[0, -1], 0], layout.tau
-        if len(layout.begin):
-            ends.append((stage, stage.formation, z[0], layout.begin, tau[0, 0]))
-        if len(layout.finish):
-            ends.append((stage, stage.ending, z[1], layout.finish, tau[-1, -1]))
-            if scheme.ends:
+        if len(layout.start_forces):
+            ends.append((stage, stage.formation, z[0], layout.start_forces, tau[0, 0]))
+        if len(layout.end_forces):
+            ends.append((stage, stage.ending, z[1], layout.end_forces, tau[-1, -1]))
+            if scheme.has_end:
                 # Case: phase 11 of query 15, whose end no torques hold otherwise.
                 columns = {"z": z[1], "a": layout.a[-1, -1]}
                 brake = brake_kernel(stage.formation)
@@ -550,9 +558,9 @@ def hold_ends(
         rows.add_entries(rows.linear(n_c, low=epsilon, high=np.inf), c_n, 1.0)
         for k, mu in enumerate(formation.friction.tolist()):
             if signs[k] or not mu:
-                equal = rows.linear(1)
-                rows.add_entries(equal, c_t[k], 1.0)
-                rows.add_entries(equal, c_n[k], signs[k] * mu)
+                friction_row = rows.linear(1)
+                rows.add_entries(friction_row, c_t[k], 1.0)
+                rows.add_entries(friction_row, c_n[k], signs[k] * mu)
             else:
                 cone = rows.linear(2, low=mu * epsilon, high=np.inf)
                 rows.add_entries(cone, c_n[k], mu)
@@ -562,44 +570,44 @@ def hold_ends(
     if (first := stages[0]).phase:
         # A command approaches a torque limit only asymptotically in the pause before.
         scene, joints = first.formation.scene, np.flatnonzero(first.formation.scene.actuator_lag)
-        limit, fastest = scene.torque_limit[joints], scene.torque_rate_limit[joints]
-        most = 1 - np.minimum(0.05, fastest * scene.actuator_lag[joints] / limit)
-        bounds = rows.linear(len(joints), low=-most, high=most)
+        limit, rate = scene.torque_limit[joints], scene.torque_rate_limit[joints]
+        largest = 1 - np.minimum(0.05, rate * scene.actuator_lag[joints] / limit)
+        bounds = rows.linear(len(joints), low=-largest, high=largest)
         rows.add_entries(bounds, layouts[0].tau[0, 0, joints], 1 / limit)
 
 
-def find_relieved(stage: Stage, limits: LimitSet) -> Flags:
-    """Sides with bound zero in each interval, as forces vanish or set in or slip, (K, n_sides)."""
-    relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
+def find_zero_bounds(stage: Stage, limits: LimitSet) -> Flags:
+    """Sides with bound zero in each interval, where contacts begin, end or slip, (K, n_sides)."""
+    zero_bounds = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
     if stage.formation.scene.has_slow_motors:
-        for contact, slips in stage.fading:
-            kinds = (CONE,) if slips else (PRESS, CONE)
-            relieved[-1] |= _find_sides(stage, limits, contact, *kinds)
-        for contact in stage.growing:
-            relieved[0] |= _find_sides(stage, limits, contact, PRESS, CONE)
-    return relieved
+        for contact, sign in stage.ending_constraints:
+            kinds = (CONE,) if sign else (PRESS, CONE)
+            zero_bounds[-1] |= _find_sides(stage, limits, contact, *kinds)
+        for contact in stage.new_contacts:
+            zero_bounds[0] |= _find_sides(stage, limits, contact, PRESS, CONE)
+    return zero_bounds
 
 
 def _find_sides(stage: Stage, limits: LimitSet, contact: int, *kinds: str) -> Flags:
-    """Whether sides, (n_sides,), are of limits of some kinds of a contact."""
+    """Mask of the sides, (n_sides,), that belong to a contact's limits of some kinds."""
     name, owners = stage.formation.names[contact], limits.owners[limits.sides[0]]
     flags = [limit.kind in kinds and limit.part == name for limit in limits.limits]
     return np.array(flags)[owners]
 
 
 def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
-    """Durations of control periods, and their torques, constant or linear and continuous.
+    """Add rows for control periods: durations, and constant or linear continuous torques.
 
-    Without a given duration all periods but the last of a phase, which may be shorter, are equal.
+    Without a prescribed duration all periods are equal; the last of a phase may be shorter.
     """
     scene, duration = stages[0].formation.scene, stages[0].period
-    linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
-    # Of each interval: its stage, period and share of the stage, and its unknowns.
+    linear, continuous = scene.control_hold == "linear", scene.has_slow_motors
+    # Stage, period, fraction of the stage and unknowns of each interval.
     owners = [k for k, stage in enumerate(stages) for _ in stage.periods]
     periods = [period for stage in stages for period in stage.periods]
     share = np.concatenate([stage.guess.fractions for stage in stages])
     h, tau = (np.concatenate([getattr(part, name) for part in layouts]) for name in ("h", "tau"))
-    first: Indices | None = None  # durations of the parts of the first period that is not a last
+    first: Indices | None = None  # durations of the intervals of the first full period
     for _, intervals in groupby(range(len(h)), key=lambda i: stages[owners[i]].phase):
         phase = list(intervals)
         last = periods[phase[-1]]
@@ -607,63 +615,63 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
             parts, least = list(group), 0.0 if period == last else duration
             if duration or first is not None:
                 low = least if duration or period != last else -np.inf
-                whole = rows.linear(1, low=low, high=duration)
-                rows.add_entries(whole, h[parts], 1.0)
+                total = rows.linear(1, low=low, high=duration)
+                rows.add_entries(total, h[parts], 1.0)
                 if not duration:
-                    rows.add_entries(whole, first, -1.0)
+                    rows.add_entries(total, first, -1.0)
             elif period != last:
                 first = h[parts]
-            for one, other in pairwise(parts):
-                if owners[one] == owners[other]:
-                    weights = np.array([share[other], -share[one]]) / (share[one] + share[other])
-                    rows.add_entries(rows.linear(1), h[[one, other]], weights)
+            for k, next_k in pairwise(parts):
+                if owners[k] == owners[next_k]:
+                    weights = np.array([share[next_k], -share[k]]) / (share[k] + share[next_k])
+                    rows.add_entries(rows.linear(1), h[[k, next_k]], weights)
                 if linear:
-                    slopes = {"before": tau[one].ravel(), "after": tau[other].ravel()}
-                    rows.add_copies(slope_kernel(), slopes | {"h": h[[one]], "coming": h[[other]]})
-        for one, other in pairwise(phase):
-            if not goes_on and (linear or periods[one] == periods[other]):
-                rows.add_equal(tau[other, 0], tau[one, -1], 1 / scene.torque_limit)
+                    slopes = {"before": tau[k].ravel(), "after": tau[next_k].ravel()}
+                    rows.add_copies(slope_kernel(), slopes | {"h": h[[k]], "h_next": h[[next_k]]})
+        for k, next_k in pairwise(phase):
+            if not continuous and (linear or periods[k] == periods[next_k]):
+                rows.add_equal(tau[next_k, 0], tau[k, -1], 1 / scene.torque_limit)
 
 
 def find_bounds(
-    nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme, limits: Sequence[LimitMisses]
+    nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme, tightening: Sequence[LimitViolations]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Bounds of the NLP's unknowns and of its rows, with limits raised."""
+    """Bounds of the NLP's unknowns and of its rows, with tightened limits."""
     low, high = np.full((2, nlp.layouts[-1].stop), [[-np.inf], [np.inf]])
     low_g, high_g = nlp.rows.bounds
-    every = zip(stages, [*stages[1:], None], nlp.layouts, nlp.rows_of, limits, strict=True)
+    groups = zip(stages, [*stages[1:], None], nlp.layouts, nlp.rows_of, tightening, strict=True)
     starts = dict[int, Array]()  # of phases
-    for stage, coming, layout, rows, raised in every:
-        low[layout.short] = 0.0
+    for stage, next_stage, layout, rows, amounts in groups:
+        low[layout.shortfalls] = 0.0
         low[layout.h] = 1e-6  # least duration of an interval, in the scene's unit
-        if coming is not None and stage.ends_in_impact:
-            low[layout.impulses[: coming.formation.n_contacts]] = 0.0
-        if stage.ahead is not None:
-            # A coordinate stays before the value at which the phase ends.
-            row, value, side = stage.ahead
-            left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
+        if next_stage is not None and stage.ends_in_impact:
+            low[layout.impulses[: next_stage.formation.n_contacts]] = 0.0
+        if stage.approach is not None:
+            # A coordinate does not reach the value at which the phase ends before its end.
+            row, value, side = stage.approach
+            remaining = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
             start = starts.setdefault(stage.phase, stage.guess.nodes[0, 0])
             # Phase 2 of scene 96 of seed 1128 goes on by 1.3e-4 in all.
-            before = min(1e-3, 0.1 * abs(value - float(start[row])))
-            most = value - side * before * np.minimum(1.0, (2 * left) ** 2)
-            if stage.until is not None and scheme.ends:
-                most[-1, -1] = side * np.inf
-            (low, high)[int(side > 0)][layout.z[..., row]] = most
-        still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
-        rates = least_senses(stage, stage.guess.places(scheme.points))
+            distance = min(1e-3, 0.1 * abs(value - float(start[row])))
+            extreme = value - side * distance * np.minimum(1.0, (2 * remaining) ** 2)
+            if stage.until is not None and scheme.has_end:
+                extreme[-1, -1] = side * np.inf
+            (low, high)[int(side > 0)][layout.z[..., row]] = extreme
+        zero_rates = find_zero_rates(stage, stage is stages[-1]) if scheme.has_end else set()
+        rates = least_rates(stage, stage.guess.places(scheme.points))
         for joint, sigma in enumerate(stage.directions.sigma):
             speeds = layout.v[..., 3 + joint]
-            one_way = rates[..., joint - 2] + raised.sense[:, joint - 2, None]
-            if stage.formation.n_contacts + joint in still:
-                one_way[-1, -1] = -np.inf
+            least_speed = rates[..., joint - 2] + amounts.rates[:, joint - 2, None]
+            if stage.formation.n_contacts + joint in zero_rates:
+                least_speed[-1, -1] = -np.inf
             if sigma > 0:
-                low[speeds] = one_way
+                low[speeds] = least_speed
             else:
-                high[speeds] = -one_way
+                high[speeds] = -least_speed
         sides, signs, values = rows.limits.sides
-        # Forces that vanish or set in are only nonnegative.
-        least = np.where(find_relieved(stage, rows.limits), 0.0, signs * values)
-        least += raised.held * rows.limits.scales[sides]
+        # Forces of contacts that begin or end are only nonnegative.
+        least = np.where(find_zero_bounds(stage, rows.limits), 0.0, signs * values)
+        least += amounts.sides * rows.limits.scales[sides]
         for side, on_rows, indices in rows.parts:
             floor = least[:, side, None]
             if on_rows:
@@ -673,70 +681,70 @@ def find_bounds(
             else:
                 high[indices] = np.minimum(high[indices], -floor)
         if stage.formation.scene.has_slow_motors:
-            _free_equal(stage, rows, scheme, low, low_g)
-        low_g[rows.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
-        low_g[rows.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
+            _drop_bounds(stage, rows, scheme, low, low_g)
+        low_g[rows.monitor_rows] += amounts.gaps[:, None, list(stage.monitored)]
+        low_g[rows.slip_rates] += amounts.rates[:, None, list(stage.formation.rubbing_rows)]
     return (low, high), (low_g, high_g)
 
 
-def _free_equal(stage: Stage, rows: StageRows, scheme: Scheme, low_x: Array, low_g: Array) -> None:
-    """Remove bounds, in place, of forces that are given by equations."""
-    for contact, slips in stage.fading:
-        given = _find_sides(stage, rows.limits, contact, CONE if slips else PRESS)
+def _drop_bounds(stage: Stage, rows: StageRows, scheme: Scheme, low_x: Array, low_g: Array) -> None:
+    """Remove bounds, in place, of forces that equations determine."""
+    for contact, sign in stage.ending_constraints:
+        determined = _find_sides(stage, rows.limits, contact, CONE if sign else PRESS)
         for side, on_rows, indices in rows.parts:
-            if given[side] and on_rows and not slips:
-                if not scheme.ends:  # the row of the end; otherwise a point's bound, below
+            if determined[side] and on_rows and not sign:
+                if not scheme.has_end:  # the row of the end; otherwise a point's bound, below
                     low_g[indices[-1, 1]] = -np.inf
-            elif given[side]:
+            elif determined[side]:
                 (low_g if on_rows else low_x)[indices[-1, -1]] = -np.inf
-    for contact in stage.growing:
-        given = _find_sides(stage, rows.limits, contact, PRESS)
+    for contact in stage.new_contacts:
+        determined = _find_sides(stage, rows.limits, contact, PRESS)
         for side, on_rows, indices in rows.parts:
-            if given[side] and on_rows:
+            if determined[side] and on_rows:
                 low_g[indices[0, 0]] = -np.inf
 
 
 @share
-def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> Kernel:
+def point_kernel(formation: Formation, controls: int, smoothed: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
-    `tau` are the control points of the torques, `shares` their Bernstein polynomials, `first` is z
-    at the start of the interval if a contact rolls, `least` are the least rates. In the `homotopy`
-    friction is regularized by tanh(rate / onset).
+    `tau` are the control points of the torques, `basis` their Bernstein polynomials, `z_start` is z
+    at the start of the interval if a contact rolls, `least` are the least rates. If `smoothed`
+    friction is regularized by tanh(rate / smoothing).
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
-    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, first=5 * rolls)
+    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, z_start=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * homotopy).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, basis=controls, least=n_c, smoothing=1 * smoothed).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
     Xi, sigma = p.Xi, p.sigma
-    if homotopy:
-        Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
+    if smoothed:
+        Xi, sigma = ca.tanh(A_t @ s.v / p.smoothing), ca.tanh(s.v[3:] / p.smoothing)
     if rolls:
-        gaps[n_c:] -= formation.build_constraints(s.first, s.v)[0][n_c:]
-    push = build_force_rows(formation, P, A_t, Xi).T @ s.forces
-    at_joints = ca.reshape(s.tau, 2, controls) @ p.shares - ca.DM(scene.dry[3:]) * sigma
-    applied = push + ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, at_joints)
+        gaps[n_c:] -= formation.build_constraints(s.z_start, s.v)[0][n_c:]
+    contact_forces = build_force_rows(formation, P, A_t, Xi).T @ s.forces
+    joint_torques = ca.reshape(s.tau, 2, controls) @ p.basis - ca.DM(scene.dry[3:]) * sigma
+    applied = contact_forces + ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, joint_torques)
     return build_kernel(
         s,
         p,
         gaps=gaps,
         rates=P @ s.v,
-        bends=P @ s.a + P_dot_v,
+        accelerations=P @ s.a + P_dot_v,
         balance=ca.DM(scene.mass_diagonal) * s.a + ca.DM(scene.viscous) * s.v - applied,
-        # With `:`, no rows of a single one are no rows, and not a row without columns.
-        senses=(p.Xi * (A_t @ s.v) - p.least)[list(formation.rubbing_rows), :],
+        # `:` keeps the column where no row is selected.
+        slip_rates=(p.Xi * (A_t @ s.v) - p.least)[list(formation.rubbing_rows), :],
     )
 
 
 @share
 def end_kernel(formation: Formation) -> Kernel:
-    """Contacts at the end of an interval without a point there; `first` is z at its start."""
-    x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
+    """Contacts at the end of an interval without a point there; `z_start` is z at its start."""
+    x = Columns(z=5, v=5, z_start=5 * bool(formation.rolling)).make_symbols()
     gaps, P, _, _ = formation.build_constraints(x.z, x.v)
     if formation.rolling:
         n_c = formation.n_contacts
-        gaps[n_c:] -= formation.build_constraints(x.first, x.v)[0][n_c:]
+        gaps[n_c:] -= formation.build_constraints(x.z_start, x.v)[0][n_c:]
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
@@ -747,12 +755,12 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     s are the states at the `start`, the points and, if no point is there, the `end`; r are `rates`.
     """
     scheme: Scheme = make_scheme(name, degree)
-    table, rungs = scheme.rungs, len(scheme.rungs)
-    x = Columns(start=5, points=5 * degree, end=5 * (rungs - degree), rates=5 * degree, h=1)
+    weights, count = scheme.weights, len(scheme.weights)
+    x = Columns(start=5, points=5 * degree, end=5 * (count - degree), rates=5 * degree, h=1)
     s, p = x.make_symbols(), Columns(N=5 * freedoms).make_symbols()
-    here = ca.reshape(ca.vertcat(s.points, s.end), 5, rungs)
+    states = ca.reshape(ca.vertcat(s.points, s.end), 5, count)
     rates, N = ca.reshape(s.rates, 5, degree), ca.reshape(p.N, 5, freedoms)
-    steps = here - ca.repmat(s.start, 1, rungs) - s.h * (rates @ ca.DM(table).T)
+    steps = states - ca.repmat(s.start, 1, count) - s.h * (rates @ ca.DM(weights).T)
     return build_kernel(s, p, steps=N.T @ steps)
 
 
@@ -773,19 +781,19 @@ def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
 
 
 def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
-    """Row of the limit of the range of a contact that ends near z, (5,), where another is gained.
+    """Row of the range limit of a contact that is reached near z, (5,), where `until` is gained.
 
-    None if that is gained by closing its gap, as a pointed tip also turns onto a vertex with the
-    side of its link: phase 1 of scene 412 of seed 1128.
+    None if that contact is gained by closing its gap: a pointed tip also turns onto a vertex with
+    the side of its link, in phase 1 of scene 412 of seed 1128.
     """
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     count = sum(len(build_limits(contact, formation.scene)) for contact in formation.contacts)
     ends = [k for k in gaining if k < count]
     if len(gaining) == len(ends) == 1:
         return ends[0]
-    near = 1e-3 * formation.scene.scales.length
+    tolerance = 1e-3 * formation.scene.scales.length
     values = formation.evaluate_limits(z[None])[0] if ends else ()
-    return next((k for k in ends if values[k] < near), None)
+    return next((k for k in ends if values[k] < tolerance), None)
 
 
 @share
@@ -793,12 +801,12 @@ def goal_kernel(
     formation: Formation,
     until: Until | None,
     row: int | None,
-    turns: tuple[int, ...],
-    gained: Formation | None,
+    reversals: tuple[int, ...],
+    next_formation: Formation | None,
 ) -> Kernel:
-    """End of a phase, zero rates of reversals, and zero speeds of contacts gained.
+    """End of a phase, zero rates of reversals, zero velocities of contacts of the next formation.
 
-    `row` is as of `find_range_end`.
+    `row` is the limit of `find_range_end`.
     """
     scene = formation.scene
     x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
@@ -810,26 +818,26 @@ def goal_kernel(
         parts.append(gap if row is None else formation.limits[row].value)
     if until is not None:
         parts += [z[row] - value for row, value in until.poses]
-    if turns:
+    if reversals:
         rates = ca.vertcat(formation.function(z, v)[2] @ v, v[3:])
-        parts += [rates[k] for k in turns]
-    if gained is not None:
-        P = gained.build_constraints(z, v)[1]
-        parts += [P[i, :] @ v for i in new_rows(formation, gained)]
+        parts += [rates[k] for k in reversals]
+    if next_formation is not None:
+        P = next_formation.build_constraints(z, v)[1]
+        parts += [P[i, :] @ v for i in new_rows(formation, next_formation)]
     return build_kernel(x, goals=ca.vertcat(*parts))
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
-    """Constraint rows of a formation that the one before does not have.
+    """Constraint rows of the following formation that a formation does not have.
 
-    A contact that goes on as that of a neighbouring feature has the same row.
+    A contact that continues on a neighbouring feature has the same row.
     """
     renamed = list_renamed(formation.scene, formation.contacts, following.contacts).values()
     contacts = {*formation.contacts, *renamed}
-    fresh = [i for i, c in enumerate(following.contacts) if c not in contacts]
+    new = [i for i, c in enumerate(following.contacts) if c not in contacts]
     rolling = [following.contacts[row] for row in following.rolling_rows]
     n_c = following.n_contacts
-    return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
+    return new + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
 
 
 @share
@@ -845,74 +853,74 @@ def effort_kernel(controls: int) -> Kernel:
 
 
 @share
-def bend_kernel(controls: int) -> Kernel:
+def curvature_kernel(controls: int) -> Kernel:
     """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)
-    bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
-    return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
+    differences = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
+    return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(differences**2)))
 
 
-def find_leaving(formation: Formation, following: Formation) -> list[int]:
-    """Contacts of a formation that the next one does not have."""
+def find_released(formation: Formation, following: Formation) -> list[int]:
+    """Indices of the contacts that the following formation does not have."""
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
 
 
 @share
 def impact_kernel(formation: Formation, following: Formation) -> Kernel:
-    """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation, `Xi` after it.
+    """Plastic impact onto the following formation: M5 (v+ - v-) = G+^T p, P+ v+ = 0.
 
-    Rates of gaps that open, and friction cones of rolling contacts, are nonnegative.
+    `Xi` is for after it. Rates of gaps that open, and slack of rolling contacts, are nonnegative.
     """
     scene, n_c = following.scene, following.n_contacts
     x = Columns(after=5, before=5, z=5, impulses=following.n_constraints).make_symbols()
     p = Columns(Xi=n_c).make_symbols()
     _, P, _, A_t = following.build_constraints(x.z, x.after)
-    push = build_force_rows(following, P, A_t, p.Xi).T @ x.impulses
+    impulses = build_force_rows(following, P, A_t, p.Xi).T @ x.impulses
     A = formation.function(x.z, x.after)[1]
     rolling = list(following.rolling_rows)
-    grip = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
+    cone_radius = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
     return build_kernel(
         x,
         p,
-        jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - push,
-        held=P @ x.after,
-        leaving=A[find_leaving(formation, following), :] @ x.after,
-        cones=ca.vertcat(grip - x.impulses[n_c:, :], grip + x.impulses[n_c:, :]),
+        jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - impulses,
+        velocities=P @ x.after,
+        openings=A[find_released(formation, following), :] @ x.after,
+        cones=ca.vertcat(cone_radius - x.impulses[n_c:, :], cone_radius + x.impulses[n_c:, :]),
     )
 
 
 @share
 def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
-    """Slack of the commands' control points to torque limits, over these and times h."""
+    """Slack of the control points of the commands, h (1 -+ command / limit)."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
     p = Columns(lag=2, limit=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)
-    left: list[Expression] = [ca.SX(0, 1)]
+    slack: list[Expression] = [ca.SX(0, 1)]
     for j in joints:
         for k in range(controls):
-            rise = k * (tau[j, k] - tau[j, k - 1]) if k else 0
-            rise += (n - k) * (tau[j, k + 1] - tau[j, k]) if k < n else 0
-            command = (x.h * tau[j, k] + p.lag[j] * rise) / p.limit[j]
-            left += [x.h - command, x.h + command]
-    return build_kernel(x, p, left=ca.vertcat(*left))
+            change = k * (tau[j, k] - tau[j, k - 1]) if k else 0
+            change += (n - k) * (tau[j, k + 1] - tau[j, k]) if k < n else 0
+            command = (x.h * tau[j, k] + p.lag[j] * change) / p.limit[j]
+            slack += [x.h - command, x.h + command]
+    return build_kernel(x, p, slack=ca.vertcat(*slack))
 
 
 @share
 def rest_kernel(formation: Formation) -> Kernel:
-    """Balance at rest of gravity, torques, c_n, c_t and friction of the joints (`forces`)."""
+    """Static balance of gravity, torques and `forces`: c_n, c_t and friction of the joints."""
     scene, n_c = formation.scene, formation.n_contacts
     x = Columns(z=5, forces=2 * n_c + 2, tau=2).make_symbols()
     _, A, A_t, _ = formation.function(x.z, ca.SX.zeros(5))
     c_n, c_t, friction = x.forces[:n_c], x.forces[n_c : 2 * n_c], x.forces[2 * n_c :]
-    at_joints = ca.vertcat(0, 0, 0, x.tau - friction)
-    balance = A.T @ c_n + A_t.T @ c_t + ca.DM(scene.applied_force) + at_joints
+    joint_torques = ca.vertcat(0, 0, 0, x.tau - friction)
+    balance = A.T @ c_n + A_t.T @ c_t + ca.DM(scene.applied_force) + joint_torques
     return build_kernel(x, balance=balance)
 
 
 @share
 def brake_kernel(formation: Formation) -> Kernel:
-    """Accelerations of sliding contacts and joints against their directions, from z' = 0."""
+    """Decelerations of sliding contacts and joints at z' = 0."""
     x = Columns(z=5, a=5).make_symbols()
     p = Columns(Xi=formation.n_contacts, sigma=2).make_symbols()
     A_t = formation.function(x.z, ca.SX.zeros(5))[2]
@@ -923,6 +931,6 @@ def brake_kernel(formation: Formation) -> Kernel:
 @share
 def slope_kernel() -> Kernel:
     """Difference of the slopes of linear torques in two intervals, times both durations."""
-    x = Columns(before=4, after=4, h=1, coming=1).make_symbols()
-    slopes = (x.before[2:] - x.before[:2]) * x.coming - (x.after[2:] - x.after[:2]) * x.h
+    x = Columns(before=4, after=4, h=1, h_next=1).make_symbols()
+    slopes = (x.before[2:] - x.before[:2]) * x.h_next - (x.after[2:] - x.after[:2]) * x.h
     return build_kernel(x, slopes=slopes)

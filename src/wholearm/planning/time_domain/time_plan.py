@@ -1,8 +1,8 @@
 """Plans of phases in the time domain by direct collocation, from a list of initial guesses.
 
-Phases joined in motion are one NLP, first solved on few intervals from each guess in turn, then by
-mode search and refinement; the README says which guesses are compared. Where none leads to a plan,
-the elastic problem (least violation of limits) gives another guess, or the reason.
+Phases joined in motion are one NLP. It is solved on few intervals from each guess in turn; mode
+search and refinement follow. The README says which guesses are compared. Without a plan the elastic
+problem (least violation of limits) gives another guess, or the reason.
 """
 
 from __future__ import annotations
@@ -45,29 +45,29 @@ from ..explain import (
 )
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops, value_of
-from .guesses import AT_REST, GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
+from .guesses import AT_REST, NEAREST_END, PROBLEM_MODES, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
-    WORTH,
+    MIN_GAIN,
     adapt_ends,
     change_ends,
-    drop_gone,
     drop_stops,
+    drop_vanished,
     improve,
     link,
-    list_as_good,
+    list_equivalent,
     list_neighbours,
     sign_sequence,
 )
-from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, keep_within, refine_stages
+from .solution import COSTLY, ITERATIONS, TimeSearch, TimeSolution, refine_stages, tighten_to_ranges
 from .stage import Scheme, Stage, resample, to_si
 from .time_motion import TimeMotion, make_phase_motions
 
-# Ratio of durations of a solution and its guess above which it may be another local optimum. Case:
-# a pentagon, 0.369 s from the modes of a plan of 0.094 s (the test of given modes)
-SLOWER = 1.2
+# Duration of a solution over that of its guess above which it may be another local optimum. Case: a
+# pentagon, 0.369 s from the modes of a plan of 0.094 s (test of prescribed modes)
+MAX_DURATION_RATIO = 1.2
 OTHER_ENDS = 2  # most other modes at an end that are tried
-_BRIEF = 1e-3  # duration, over a period, that counts as zero
+_TINY = 1e-3  # duration over a period that counts as zero
 
 
 def plan_phases(
@@ -77,28 +77,28 @@ def plan_phases(
     options: PlanOptions,
     duration: float | None = None,
     *,
-    to_go: CostToGo | None = None,
-    ample: float = math.inf,
+    cost_to_go: CostToGo | None = None,
+    saturation: float = math.inf,
     fastest: Sequence[PhasePlan[Motion]] = (),
-    begun: Sequence[PhasePlan[Motion]] = (),
-    free: Sequence[PhasePlan[Motion]] = (),
-    only_begin: bool = False,
+    initial_plans: Sequence[PhasePlan[Motion]] = (),
+    free_plans: Sequence[PhasePlan[Motion]] = (),
+    coarse: bool = False,
     thorough: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
-    """Plan phases that are one NLP, from rest at `z` to rest.
+    """Plans of phases that are one NLP, from rest at `z` to rest.
 
     Parameters
     ----------
     phases, z : (5,)  all but the last phase end in motion
     duration : [s]    longest duration of all these phases, for `margin`
-    to_go             cost-to-go at a free end
-    ample : [N]       saturation of the objective `margin`, as other phases keep less anyway
-    fastest           time-optimal plans from `z`, as guess for `margin`: it ends where these do if
-                      phases follow
-    begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
-    free              plans of the phases along curves or with free torques, to start from
-    only_begin        whether to find modes on few intervals alone, without limits between points
-    thorough          whether to try other guesses than the first one, and without a plan to look
+    cost_to_go        of the next phases, at a free end
+    saturation : [N]  of the objective `margin`: the least normal force of other phases limits it
+    fastest           time-optimal plans from `z`, as guess for `margin`; if phases follow, the plan
+                      ends where these do
+    initial_plans     coarse plans from nearly the same `z`, as guess
+    free_plans        plans of the phases along curves or with free torques, as guess
+    coarse            whether to plan on few intervals, without limits between points
+    thorough          whether to try other guesses after the first one, and without a plan to look
                       for a change of the problem that makes one possible
 
     Raises
@@ -106,143 +106,144 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    search = TimeSearch(problem, options, phases, duration, to_go, ample, only_begin)
+    search = TimeSearch(problem, options, phases, duration, cost_to_go, saturation, coarse)
     guesses = Guesses(search, z)
     solution: TimeSolution | None = None
-    if begun:
-        coarse, guess = begun[0], guesses.resume(begun[0].attempt, list_stages(begun))
-        if coarse.complete or coarse.sequences > 1:  # in modes that have been searched
-            search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
-            solution = solve_guesses(replace(search, searched=True), [guess])
+    if initial_plans:
+        first = initial_plans[0]
+        guess = guesses.resume(first.attempt, list_stages(initial_plans))
+        if first.complete or first.sequences > 1:  # its modes come from a mode search
+            search.statistics.sequences = first.sequences
+            search.statistics.complete = first.complete
+            solution = solve_guesses(replace(search, modes_searched=True), [guess])
         else:
             solution = solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
     stages, pinned = list_stages(fastest), phases[-1].index + 1 < len(problem.phases)
 
     def replan(parameter: Parameter, value: float) -> object:
-        other = change_limit(problem, parameter.key, value)
-        same = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, same, z, options.roughen(), thorough=False)
+        changed = change_limit(problem, parameter.key, value)
+        block = [changed.phases[phase.index] for phase in phases]
+        return plan_phases(changed, block, z, options.roughen(), thorough=False)
 
-    explanation = replan if thorough else None
-    if solution is None and free:
-        guess = guesses.along(free)
+    replanner = replan if thorough else None
+    if solution is None and free_plans:
+        guess = guesses.from_plans(free_plans)
         if problem.scene.has_slow_motors or problem.scene.control_period:
-            solution = change_torques(search, guess.from_rest(), stages if pinned else [])
+            solution = limit_torques(search, guess.from_rest(), stages if pinned else [])
         else:
             solution = solve_guesses(search, [guess.from_rest()])
-            # One that costs 0.1 % more is another local optimum: a kite (0, 0), (80, 0), (95, 40),
-            # (40, 85), (-10, 45) mm, 0.3 kg, of `wholearm new` that turns to edge 1 brakes before
-            # its impact, in 0.1600 for 0.1508 s.
-            compares = guess.rests and search.goal is not Objective.MARGIN
-            plans = list_plans(search, solution) if solution and compares else []
-            if solution and sum(p.value for p in plans) > 1.001 * sum(p.value for p in free):
+            # A plan that costs 0.1 % more is another local optimum. Case: a kite (0, 0), (80, 0),
+            # (95, 40), (40, 85), (-10, 45) mm, 0.3 kg, of `wholearm new` that turns to edge 1. It
+            # brakes before its impact, and takes 0.1600 for 0.1508 s.
+            comparable = guess.is_rest_to_rest and search.goal is not Objective.MARGIN
+            plans = list_plans(search, solution) if solution and comparable else []
+            if solution and sum(p.value for p in plans) > 1.001 * sum(p.value for p in free_plans):
                 other = solve_guesses(search, [guesses.nearest])
                 solution = other if other and other.cost < solution.cost else solution
     if solution is None:
-        listed = iter([guesses.nearest])
+        candidates = iter([guesses.nearest])
         if thorough:
-            others = guesses.on_finer_intervals()
-            listed = chain(guesses.every(), _free_ends(search, guesses), others)
+            others = guesses.on_more_intervals()
+            candidates = chain(guesses.list_all(), _free_ends(search, guesses), others)
         if search.goal is Objective.MARGIN:
-            listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
-        listed = chain(guesses.list_given(), listed)
-        why = partial(refuse, search, guesses.nearest.stages, explanation)
-        solution = solve_guesses(search, listed, why)
-    if solution is None and _can_last(search, stages):
+            candidates = _list_margin_guesses(search, candidates, stages, pinned, guesses.nearest)
+        candidates = chain(guesses.list_problem_guesses(), candidates)
+        refusal = partial(refuse, search, guesses.nearest.stages, replanner)
+        solution = solve_guesses(search, candidates, refusal)
+    if solution is None and _fits_duration(search, stages):
         raise SolverError(
             f"no plan for {name_phases(search.numbers)}: the solver did not converge for the "
             "largest margin, although the motion of least time keeps all limits; try another "
             "duration (--duration) or number of intervals per phase (--time-intervals)"
         )
     if solution is None:
-        solution = _solve_elastic(search, guesses, explanation)
+        solution = _solve_elastic(search, guesses, replanner)
     plans = list_plans(search, solution)
     if problem.scene.control_period:
-        kept = "error", "sequences", "complete"
+        names = "error", "sequences", "complete"
         return [
-            plan._replace(unheld=other.value, **{name: getattr(other, name) for name in kept})
-            for plan, other in zip(plans, free, strict=True)
+            plan._replace(unheld=other.value, **{name: getattr(other, name) for name in names})
+            for plan, other in zip(plans, free_plans, strict=True)
         ]
     return plans
 
 
-def change_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> TimeSolution:
-    """The plan with the torques that motors and control periods allow, from one with free torques.
+def limit_torques(search: TimeSearch, guess: Guess, fastest: Sequence[Stage]) -> TimeSolution:
+    """Solution under motor limits and control periods, from a guess with free torques.
 
-    It keeps the modes of that, and for `margin` ends where the stages `fastest` do, if any.
+    It keeps the modes of the guess; for `margin` it ends where the stages `fastest` do, if any.
     """
-    last = guess.stages[-1]
     if fastest and search.goal is Objective.MARGIN:
         guess = guess.end_at(fastest[-1].guess.nodes[-1, 0], search.problem)
-    if search.to_go is not None:
+    if search.cost_to_go is not None:
         with suppress(WholearmError):
-            search = replace(search, price=search.expand(last.guess.nodes[-1, 0])[1])
+            search = replace(search, price=search.expand(guess.stages[-1].guess.nodes[-1, 0])[1])
     stages = drop_stops(guess.stages)
     if search.source.scene.has_slow_motors:
-        solution = reach_motors(search, stages)
+        solution = meet_motor_limits(search, stages)
         stages = solution.stages
     if search.source.scene.control_period:
         solution = hold_torques(search, stages)
     return solution._replace(attempt=guess.name)
 
 
-def reach_motors(search: TimeSearch, free: Sequence[Stage]) -> TimeSolution:
-    """The plan with the limits of motors from one with free torques, by continuation in these.
+def meet_motor_limits(search: TimeSearch, free_stages: Sequence[Stage]) -> TimeSolution:
+    """Solution under rate limits and lag from one with free torques, by continuation in these.
 
-    Case: phases 6 and 7 of query 0 have a plan from motors 4 times as quick alone.
+    Case: phases 6 and 7 of query 0 have a plan only from that with motors 4 times as fast.
 
     Raises
     ------
-    InfeasibleError  if that does not lead to the limits; it names those of the last plan
+    InfeasibleError  if the continuation does not reach the limits; it names those of the last plan
     """
-    require_hold_at_ends(search, free)
-    plans, tried = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
-    stages = own = adapt_ends(free, search)
+    require_hold_at_ends(search, free_stages)
+    plans, factors = list[tuple[float, TimeSearch, TimeSolution]](), list[float]()
+    stages = adapted = adapt_ends(free_stages, search)
 
-    def reaches(factor: float) -> bool:
-        """Whether there is a solution with motors so many times as quick, from the last one."""
+    def solve_relaxed(factor: float) -> bool:
+        """Whether there is a solution with motors `factor` times as fast, from the last one."""
         nonlocal stages
-        tried.append(factor)
+        factors.append(factor)
         scene = search.source.scene.quicken(factor)
-        quick = replace(search, source=replace(search.source, scene=scene))
-        moved = link([stage.move_to(quick.problem.scene) for stage in stages])
-        solution = quick.solve(moved, most=80)
+        relaxed = replace(search, source=replace(search.source, scene=scene))
+        moved = link([stage.move_to(relaxed.problem.scene) for stage in stages])
+        solution = relaxed.solve(moved, max_iter=80)
         if solution.success:
-            plans.append((factor, quick, solution))
+            plans.append((factor, relaxed, solution))
             stages = solution.stages
         return solution.success
 
     def refine_last() -> TimeSolution:
-        return plans[-1][2] if search.only_begins else refine_stages(search, plans[-1][2])
+        return plans[-1][2] if search.coarse else refine_stages(search, plans[-1][2])
 
-    # Cases of other modes at an end: phase 8 of query 24, where a contact rolls that hardly slides
-    # with free torques, and phases 2 and 3 of query 0, where one slides back.
-    for candidate in chain([own], islice(change_ends(own, search), OTHER_ENDS)):
+    # Cases of other modes at an end: phase 8 of query 24, where a contact rolls that slides slowly
+    # with free torques, and phases 2 and 3 of query 0, where a contact slides back.
+    for candidate in chain([adapted], islice(change_ends(adapted, search), OTHER_ENDS)):
         stages = [stage.stretch(1.3) for stage in candidate]
-        if reaches(1.0) and (solution := refine_last()).success:
+        if solve_relaxed(1.0) and (solution := refine_last()).success:
             return solution
-    stages, step = [stage.stretch(1.3) for stage in own], 4.0
+    stages, step = [stage.stretch(1.3) for stage in adapted], 4.0
     if plans:
-        reaches(step)
+        solve_relaxed(step)
         # Case: the pentagon (0, 0), (90, 0), (100, 50), (60, 90), (0, 70) mm, 0.28 kg, of
         # `wholearm new` with 900 N m/s, phase 6 to edge 1.
-        reaches(step**2)
-    elif reaches(step) or reaches(step**2):
+        solve_relaxed(step**2)
+    elif solve_relaxed(step) or solve_relaxed(step**2):
         while step > 1.1 and plans[-1][0] > 1:
-            if not reaches(max(1.0, plans[-1][0] / step)):
+            if not solve_relaxed(max(1.0, plans[-1][0] / step)):
                 step = math.sqrt(step)
         if plans[-1][0] == 1 and (solution := refine_last()).success:
             return solution
-    for factor, quick, solution in sorted(plans, key=lambda plan: plan[0]):
-        rough = replace(quick, options=quick.options.roughen())
-        if factor > 1 and refine_stages(rough, solution).success:
+    for factor, relaxed, solution in sorted(plans, key=lambda plan: plan[0]):
+        coarse = replace(relaxed, options=relaxed.options.roughen())
+        if factor > 1 and refine_stages(coarse, solution).success:
             break
     else:
         factor = math.inf
     scene = search.source.scene
-    quick_scene = scene.quicken(factor) if math.isfinite(factor) else None
-    most = f"motors {max(tried):g} times as quick"
-    raise refuse_motors(scene, quick_scene, search.numbers, tried=most)
+    relaxed_scene = scene.quicken(factor) if math.isfinite(factor) else None
+    attempt = f"motors {max(factors):g} times as quick"
+    raise refuse_motors(scene, relaxed_scene, search.numbers, attempt=attempt)
 
 
 def try_phases(
@@ -251,41 +252,40 @@ def try_phases(
     z: Array,
     options: PlanOptions,
     goal: Array | None = None,
-    further: bool = False,
+    all_guesses: bool = False,
     single_guess: bool = False,
-    stopped: Sequence[PhasePlan[TimeMotion]] = (),
+    stop_plans: Sequence[PhasePlan[TimeMotion]] = (),
 ) -> list[PhasePlan[TimeMotion]] | None:
-    """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
+    """Coarse plans of phases without a mode search; None without a plan.
 
     Parameters
     ----------
     goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
-    further       whether guesses after the first ones are tried
+    all_guesses   whether the friction homotopy and the guesses after it are tried
     single_guess  whether to solve from one guess alone
-    stopped       plans of the phases, each from rest to rest, as the only guess
+    stop_plans    plans of the phases, each from rest to rest, as the only guess
     """
-    rough = replace(options, mode_search=False)
-    search = TimeSearch(problem, rough, phases, only_begins=True)
+    coarse_options = replace(options, mode_search=False)
+    search = TimeSearch(problem, coarse_options, phases, coarse=True)
     guesses = Guesses(search, z)
-    listed: Iterable[Guess] = guesses.every(goal)
-    if stopped:
-        listed = [guesses.without_stops(stopped)]
+    candidates: Iterable[Guess] = guesses.list_all(goal)
+    if stop_plans:
+        candidates = [guesses.without_stops(stop_plans)]
     elif single_guess:
-        # The nearest end is another guess than a straight path that limits exclude.
-        single = guesses.nearest if goal is None else guesses.straight(goal)
-        listed = [single] if single else []
+        # No substitute for a straight path that limits exclude.
+        guess = guesses.nearest if goal is None else guesses.guess_straight(goal)
+        candidates = [guess] if guess else []
     else:
-        if not further:
-            listed = takewhile(lambda guess: not guess.homotopy, listed)
-        listed = chain(listed, _free_ends(search, guesses))
-    # Many edges have no plan. From one with a stop query 10 takes 23 to 53 iterations, by rounding.
-    solution = solve_guesses(search, listed, most=60 if stopped else 35)
+        if not all_guesses:
+            candidates = takewhile(lambda guess: not guess.homotopy, candidates)
+        candidates = chain(candidates, _free_ends(search, guesses))
+    # Many edges have no plan. From a plan with a stop query 10 takes 23 to 53 iterations.
+    solution = solve_guesses(search, candidates, max_iter=60 if stop_plans else 35)
     if solution is None:
         return None
-    # Of six stages of phase 3 of goal 19 of the corpus three have vanished; no plan is found from
-    # all of them.
-    left = drop_gone(search, solution)._replace(attempt=solution.attempt)
-    first, *others = list_plans(search, left)
+    # Of six stages of phase 3 of goal 19 of the corpus three vanish; from all six no plan is found.
+    remaining = drop_vanished(search, solution)._replace(attempt=solution.attempt)
+    first, *others = list_plans(search, remaining)
     return [first._replace(complete=not options.mode_search), *others]
 
 
@@ -293,147 +293,146 @@ def solve_guesses(
     search: TimeSearch,
     guesses: Iterable[Guess],
     refuse: Callable[[], None] | None = None,
-    most: int = ITERATIONS,
+    max_iter: int = ITERATIONS,
 ) -> TimeSolution | None:
-    """The best plan from guesses that are tried in their order; None without any.
+    """The best refined solution from guesses that are tried in their order; None without one.
 
-    If the first ones fail, `refuse` may raise an error that says why. At most `most` solver
-    iterations are made from each in its modes.
+    If the guess to the nearest end fails, `refuse` may raise an error that says why. `max_iter` is
+    the most solver iterations from a guess in its modes.
     """
-    coarse, lost, compared = list[TimeSolution](), list[TimeSolution](), False
+    solutions, failures, has_homotopy = list[TimeSolution](), list[TimeSolution](), False
     for guess in guesses:
-        if coarse and not guess.homotopy:
+        if solutions and not guess.homotopy:
             continue
-        compared |= guess.homotopy
-        solution = solve_coarse(search, guess, most)
-        if solution.success and any(is_same(solution, other) for other in lost):
+        has_homotopy |= guess.homotopy
+        solution = solve_coarse(search, guess, max_iter)
+        if solution.success and any(is_same(solution, other) for other in failures):
             continue
         if solution.success:
-            coarse.append(solution)
-        elif refuse and not coarse and guess.name == NEAREST:
+            solutions.append(solution)
+        elif refuse and not solutions and guess.name == NEAREST_END:
             refuse()
-        if coarse and (compared or not may_gain(search, guess, solution)):
-            if best := _refine_best(search, coarse):
+        if solutions and (has_homotopy or not may_gain(search, guess, solution)):
+            if best := _refine_best(search, solutions):
                 return best
-            lost, coarse = lost + coarse, []
-    return _refine_best(search, coarse)
+            failures, solutions = failures + solutions, []
+    return _refine_best(search, solutions)
 
 
-def solve_coarse(search: TimeSearch, guess: Guess, most: int) -> TimeSolution:
-    """Solve from a guess in its modes, by `most` iterations at most, or those of the homotopy."""
+def solve_coarse(search: TimeSearch, guess: Guess, max_iter: int) -> TimeSolution:
+    """Solve from a guess in its modes, in at most `max_iter` iterations, or in the homotopy's."""
     stages = guess.stages
     if guess.homotopy:
         solution = find_modes(search, stages)
         if not solution.success:
             return solution
-        stages, most = solution.stages, 80  # most iterations in modes of the homotopy
-    solution = search.solve(stages, guess.before, most)
+        stages, max_iter = solution.stages, 80  # most iterations in modes of the homotopy
+    solution = search.solve(stages, guess.previous, max_iter)
     if solution.success and solution.margin < -5e-7:  # rounding
-        # A motion that presses too little may be far from one that presses enough.
+        # Such a motion may be far from one whose normal forces reach epsilon.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
     return solution._replace(attempt=guess.name)
 
 
-def is_same(one: TimeSolution, other: TimeSolution) -> bool:
-    """Whether two solutions are the same but for rounding: their cost and their modes."""
-    close = math.isclose(one.cost, other.cost, rel_tol=1e-6)
-    return close and sign_sequence(one.stages) == sign_sequence(other.stages)
+def is_same(first: TimeSolution, second: TimeSolution) -> bool:
+    """Whether two solutions have the same modes and, but for rounding, the same cost."""
+    close = math.isclose(first.cost, second.cost, rel_tol=1e-6)
+    return close and sign_sequence(first.stages) == sign_sequence(second.stages)
 
 
 def may_gain(search: TimeSearch, guess: Guess, solution: TimeSolution) -> bool:
-    """Whether a solution suggests other contact modes, or in given ones takes far longer."""
-    if guess.name == GIVEN:
+    """Whether other modes may be better, or a solution takes far longer than its guess."""
+    if guess.name == PROBLEM_MODES:
         duration = sum(stage.guess.duration for stage in guess.stages)
-        return search.goal is Objective.TIME and solution.cost > SLOWER * duration
-    if not search.options.mode_search or search.searched or search.has_ample(solution):
+        return search.goal is Objective.TIME and solution.cost > MAX_DURATION_RATIO * duration
+    if not search.options.mode_search or search.modes_searched or search.is_saturated(solution):
         return False
     sequence = sign_sequence(solution.stages)
-    return any(sign_sequence(moved) != sequence for moved in list_neighbours(search, solution))
+    return any(sign_sequence(other) != sequence for other in list_neighbours(search, solution))
 
 
-def _refine_best(search: TimeSearch, coarse: Sequence[TimeSolution]) -> TimeSolution | None:
-    """The best of refined solutions, of which those are left out whose coarse ones cost more."""
+def _refine_best(search: TimeSearch, solutions: Sequence[TimeSolution]) -> TimeSolution | None:
+    """The best solution after refinement, in order of the coarse costs; None without one."""
     best: TimeSolution | None = None
-    for rough in sorted(coarse, key=attrgetter("cost")):
-        if best and best.cost < rough.cost:
+    for solution in sorted(solutions, key=attrgetter("cost")):
+        if best and best.cost < solution.cost:
             break
-        solution = finish(search, rough)._replace(attempt=rough.attempt)
-        if solution.success and (best is None or solution.cost < best.cost):
-            best = solution
+        refined = finish(search, solution)._replace(attempt=solution.attempt)
+        if refined.success and (best is None or refined.cost < best.cost):
+            best = refined
     return best
 
 
 def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """Search modes, choose a free end, refine, and hold torques over control periods."""
-    searched = solution
-    if search.options.mode_search and not (search.searched or search.has_ample(solution)):
-        searched = improve(search, solution)
-    search, coarse = choose_end(search, searched)
-    if search.only_begins:
+    """Solution after mode search, choice of a free end, refinement and tightening to ranges."""
+    improved = solution
+    if search.options.mode_search and not (search.modes_searched or search.is_saturated(solution)):
+        improved = improve(search, solution)
+    search, coarse = choose_end(search, improved)
+    if search.coarse:
         return coarse
     refined = refine_stages(search, coarse)
     if not refined.success and search.options.mode_search and refined.status != COSTLY:
-        # Phase 2 of the route of query 10 has no solution in which a contact turns back without
-        # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
-        # search leads.
-        neighbours = list_as_good(search, coarse, list_neighbours(search, coarse))
-        others = chain(neighbours, [solution] * (searched is not solution))
-        solutions = (refine_stages(search, other) for other in others)
+        # Phase 2 of the route of query 10 has no solution in which a contact reverses without
+        # sticking; phase 1 of that of query 91, and phase 5 of that of goal 45, have none in the
+        # modes of the mode search.
+        neighbours = list_equivalent(search, coarse, list_neighbours(search, coarse))
+        candidates = chain(neighbours, [solution] * (improved is not solution))
+        solutions = (refine_stages(search, candidate) for candidate in candidates)
         refined = next((solution for solution in solutions if solution.success), refined)
     if not refined.success:
         return refined
-    fewer = drop_gone(search, refined)
-    if fewer is not refined:
-        # Phase 3 of query 57 does not hold in its replay otherwise.
-        fewer = refine_stages(search, fewer)
-        if fewer.success and fewer.cost - refined.cost < WORTH * abs(refined.cost):
-            refined = fewer
-    return keep_within(search, refined) if search.options.ranges else refined
+    reduced = drop_vanished(search, refined)
+    if reduced is not refined:
+        # Otherwise phase 3 of query 57 fails in its replay.
+        reduced = refine_stages(search, reduced)
+        if reduced.success and reduced.cost - refined.cost < MIN_GAIN * abs(refined.cost):
+            refined = reduced
+    return tighten_to_ranges(search, refined) if search.options.ranges else refined
 
 
-def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
-    """The plan with torques held over control periods, from one with free torques.
+def hold_torques(search: TimeSearch, free_stages: list[Stage]) -> TimeSolution:
+    """Solution with torques held over control periods, from one with free torques.
 
-    How many periods each phase takes follows from the motion with as many periods of one duration
-    that is free: that is solved again while it takes another number of given periods. The NLP then
+    First all periods have the same unknown duration; this NLP is solved again until the number of
+    prescribed periods that its motion takes stays. Then the periods get their duration, and the NLP
     shortens the last period of each phase.
 
     Raises
     ------
-    InfeasibleError  if none is found; it names a shorter period with which one is
+    InfeasibleError  if none is found; it names a shorter period with which there is a plan
     """
     scene = search.problem.scene
-    controls = 2 if scene.control_hold == "linear" else 1
-    held = replace(search, controls=controls)
+    search = replace(search, controls=2 if scene.control_hold == "linear" else 1)
 
     def solve(stages: list[Stage], period: float, stretch: float, equal: bool) -> TimeSolution:
-        # Phases 2 to 4 of a pentagon take 70 at 2 ms. More than from a guess, so that a solve that
-        # fails is made again: queries 38 and 45 at 2 ms.
-        most = 150 if equal else 80
-        return held.solve(cut_periods(stages, held.scheme, period, stretch, equal), most=most)
+        # Phases 2 to 4 of a pentagon take 70 at 2 ms. More than `ITERATIONS`, so that a failure is
+        # solved again: queries 38 and 45 at 2 ms.
+        stages = cut_periods(stages, search.scheme, period, stretch, equal)
+        return search.solve(stages, max_iter=150 if equal else 80)
 
-    def hold(period: float, most: int) -> TimeSolution | None:
-        stages = free
-        if most > 1 and sum(count_periods(free, period)) > 100:
-            # A plan with periods twice as long is one with these: 2 to 4 of a pentagon at 1 ms.
-            coarse = hold(2 * period, most)
-            stages = coarse.stages if coarse else free
+    def hold(period: float, attempts: int) -> TimeSolution | None:
+        stages = free_stages
+        if attempts > 1 and sum(count_periods(free_stages, period)) > 100:
+            # A plan with doubled periods is feasible, too: phases 2 to 4 of a pentagon at 1 ms.
+            doubled = hold(2 * period, attempts)
+            stages = doubled.stages if doubled else free_stages
         for _ in range(4):  # most times that numbers of periods change
             solution = solve(stages, period, 1.0, equal=True)
             if not solution.success:
                 break
-            before, stages = stages, solution.stages
-            if count_periods(before, period) == count_periods(stages, period):
+            previous, stages = stages, solution.stages
+            if count_periods(previous, period) == count_periods(stages, period):
                 break
         stretch = 1.0
-        for _ in range(most):  # durations
+        for _ in range(attempts):  # durations
             solution = solve(stages, period, stretch, equal=False)
-            while solution.success and (shorter := drop_periods(solution.stages)):
-                fewer = held.solve(shorter, most=ITERATIONS)
-                if not fewer.success or fewer.cost > solution.cost:
+            while solution.success and (remaining := drop_periods(solution.stages)):
+                reduced = search.solve(remaining, max_iter=ITERATIONS)
+                if not reduced.success or reduced.cost > solution.cost:
                     break
-                solution = fewer
-            solution = refine_stages(held, solution) if solution.success else solution
+                solution = reduced
+            solution = refine_stages(search, solution) if solution.success else solution
             if solution.success:
                 return solution
             stretch += max(0.02, period / sum(stage.guess.duration for stage in stages))
@@ -441,72 +440,72 @@ def hold_torques(search: TimeSearch, free: list[Stage]) -> TimeSolution:
 
     if solution := hold(scene.control_period, 6):  # phase 3 of query 0 takes 5 at 5 ms
         return solution
-    # One duration each: six take two minutes more for phase 5 of query 1, and find nothing either.
-    share = next((part for part in (0.5, 0.2) if hold(part * scene.control_period, 1)), None)
+    # A single attempt each: six take two minutes more for phase 5 of query 1, and fail, too.
+    fraction = next((x for x in (0.5, 0.2) if hold(x * scene.control_period, 1)), None)
     scene = search.source.scene
-    quick = replace(scene, control_period=share * scene.control_period) if share else None
-    raise refuse_motors(scene, quick, search.numbers, tried="a fifth of the period")
+    relaxed = replace(scene, control_period=fraction * scene.control_period) if fraction else None
+    raise refuse_motors(scene, relaxed, search.numbers, attempt="a fifth of the period")
 
 
 def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages without the last periods of phases whose duration has vanished; none if none has.
+    """Stages without vanished last periods of phases; an empty list if there are none.
 
     Case: `triangle.toml` at 10 ms takes 1.5 % longer without it.
     """
-    dropped, changed = list(stages), False
-    for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
-        last = coming is None or coming.phase != stage.phase
-        part, kept = stage.guess, stage.periods.index(stage.periods[-1])
-        if last and kept and part.h[kept:].sum() < _BRIEF * stage.period:
-            # The end of the interval before is that of the last.
+    remaining, changed = list(stages), False
+    for k, (stage, next_stage) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
+        is_last = next_stage is None or next_stage.phase != stage.phase
+        part, count = stage.guess, stage.periods.index(stage.periods[-1])
+        if is_last and count and part.h[count:].sum() < _TINY * stage.period:
+            # The last remaining interval takes the end state of the stage.
             names = ("h", "z", "v", "a", "forces", "tau")
-            tables = {name: getattr(part, name)[:kept] for name in names}
-            guess = part._replace(**tables, nodes=np.vstack([part.nodes[:kept], part.nodes[-1:]]))
-            dropped[k], changed = replace(stage, guess=guess, periods=stage.periods[:kept]), True
-    return dropped if changed else []
+            tables = {name: getattr(part, name)[:count] for name in names}
+            guess = part._replace(**tables, nodes=np.vstack([part.nodes[:count], part.nodes[-1:]]))
+            remaining[k], changed = replace(stage, guess=guess, periods=stage.periods[:count]), True
+    return remaining if changed else []
 
 
 def count_periods(stages: Sequence[Stage], period: float) -> list[int]:
-    """How many periods each phase takes, the last of which may be shorter."""
+    """Number of periods of each phase; the last one may be shorter."""
     phases = groupby(stages, key=lambda stage: stage.phase)
     times = [sum(stage.guess.duration for stage in group) for _, group in phases]
-    return [max(1, math.ceil(time / period - _BRIEF)) for time in times]
+    return [max(1, math.ceil(time / period - _TINY)) for time in times]
 
 
 def cut_periods(
     stages: Sequence[Stage], scheme: Scheme, period: float, stretch: float, equal: bool
 ) -> list[Stage]:
-    """Stages whose intervals are periods or parts of them, stretched in time.
+    """Stages whose intervals are control periods or parts of them, stretched in time.
 
-    The duration of periods is then given, or only that they are `equal`.
+    The duration of periods is prescribed, or unknown but `equal`.
     """
-    cut, near = list[Stage](), _BRIEF * period
+    pieces, tol = list[Stage](), _TINY * period
     for stages_of_phase in (list(group) for _, group in groupby(stages, key=attrgetter("phase"))):
         start = 0.0
         for stage in stages_of_phase:
             stop = start + stretch * stage.guess.duration
-            within = stage is not stages_of_phase[-1]
-            if within and stage.fading and stop - start > period / 2:
+            inside = stage is not stages_of_phase[-1]
+            if inside and stage.ending_constraints and stop - start > period / 2:
                 # Forces step there, as torques do between periods: phase 9 of query 28 has no plan
-                # in which a contact that rolls begins to slide within a period.
-                stop = period * max(math.floor(start / period + 1 - _BRIEF), round(stop / period))
+                # in which a rolling contact begins to slide within a period.
+                stop = period * max(math.floor(start / period + 1 - _TINY), round(stop / period))
             ticks = period * np.arange(math.floor(start / period), math.ceil(stop / period) + 1)
-            edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
+            edges = np.array([start, *ticks[(ticks > start + tol) & (ticks < stop - tol)], stop])
             numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
             part = resample(stage.guess, scheme, (edges - start) / (stop - start))
-            longer = replace(stage, guess=part).stretch((stop - start) / stage.guess.duration)
-            cut.append(replace(longer, periods=numbers, period=0.0 if equal else period))
+            stretched = replace(stage, guess=part).stretch((stop - start) / stage.guess.duration)
+            pieces.append(replace(stretched, periods=numbers, period=0.0 if equal else period))
             start = stop
-    return cut
+    return pieces
 
 
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
-    """Add the cost-to-go at the end, expanded to first order, and solve again while that gains.
+    """Solution with the cost-to-go of its end, expanded to first order while that gains.
 
-    Also returns the search with the price of the last end.
+    Also returns the search with the price of the last expansion.
     """
-    best, least = (search, solution), None
-    if search.to_go is None:
+    best, least_cost = (search, solution), None
+    if search.cost_to_go is None:
         return best
     for _ in range(4):  # most expansions of the cost-to-go
         try:
@@ -516,9 +515,9 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
         total = solution.cost + value
         if search.price is not None:
             total -= float(search.price.gradient @ (solution.end - search.price.origin))
-        if least is not None and total > least - 1e-4 * abs(least):
+        if least_cost is not None and total > least_cost - 1e-4 * abs(least_cost):
             break
-        least, best = total, (search, solution)
+        least_cost, best = total, (search, solution)
         search = replace(search, price=price)
         solution = search.solve(solution.stages, solution)
         if not solution.success:
@@ -526,19 +525,19 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
     return best
 
 
-def _list_slow(
+def _list_margin_guesses(
     search: TimeSearch, guesses: Iterator[Guess], fastest: list[Stage], pinned: bool, first: Guess
 ) -> Iterator[Guess]:
-    """Guesses for the largest margin: time-optimal stages, and others, `pinned` to their end.
+    """Guesses for the largest margin, with time-optimal stages; `pinned` to the end of these.
 
     Phase 5 of `heptagon.toml` keeps 0.57 N instead of 0.68 N without the former.
     """
-    if _can_last(search, fastest):
-        # On as few intervals as the first guess has.
+    if _fits_duration(search, fastest):
+        # As many intervals as the first guess has.
         coarse = list[Stage]()
         count = sum(stage.intervals for stage in first.stages) / len({s.phase for s in fastest})
         for stage in fastest:
-            phase = sum(each.guess.duration for each in fastest if each.phase == stage.phase)
+            phase = sum(other.guess.duration for other in fastest if other.phase == stage.phase)
             intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
             breaks = np.linspace(0.0, 1.0, intervals + 1)
             coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
@@ -549,14 +548,14 @@ def _list_slow(
     return (guess.end_at(end, search.problem) for guess in guesses)
 
 
-def _can_last(search: TimeSearch, stages: Sequence[Stage]) -> bool:
-    """Whether stages, if any, keep the longest duration."""
-    lasts = sum(stage.guess.duration for stage in stages) * search.source.scene.scales.time
-    return bool(stages) and search.duration is not None and lasts <= search.duration
+def _fits_duration(search: TimeSearch, stages: Sequence[Stage]) -> bool:
+    """Whether there are stages and they take at most the longest duration."""
+    duration = sum(stage.guess.duration for stage in stages) * search.source.scene.scales.time
+    return bool(stages) and search.duration is not None and duration <= search.duration
 
 
 def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
-    """A coarse plan that chooses where phases end, moved to where they are pinned.
+    """Guess from a coarse plan with free ends, moved to the pinned ends.
 
     Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
     """
@@ -565,48 +564,48 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         return
     free = tuple(replace(p, until=replace(p.until, pins=())) for p in search.source.phases)
     problem, phases = replace(search.source, phases=free), [free[p.index] for p in search.phases]
-    free_search = replace(search, source=problem, phases=phases, to_go=None, only_begins=True)
-    coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).every())
+    free_search = replace(search, source=problem, phases=phases, cost_to_go=None, coarse=True)
+    coarse = solve_guesses(free_search, Guesses(free_search, guesses.z).list_all())
     if coarse is None:
         return
-    own = search.problem.phases
-    stages = [replace(each, goal=each.goal and own[each.phase].until) for each in coarse.stages]
-    moved = search.solve(link(stages), coarse, ITERATIONS)
-    if moved.success:
-        yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
+    targets = search.problem.phases
+    stages = [replace(s, goal=s.goal and targets[s.phase].until) for s in coarse.stages]
+    solution = search.solve(link(stages), coarse, ITERATIONS)
+    if solution.success:
+        yield Guess("a plan that chooses where it ends", solution.stages, previous=solution)
 
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> TimeSolution:
-    """Plan from motions of least violation, or the error that says why there is none."""
-    short, missed = list[list[Stage]](), list[Shortfall]()
+    """Solution from a motion of least violation; without one, the error that says why."""
+    infeasible, shortfalls = list[list[Stage]](), list[Shortfall]()
     soft = search.soften()
-    for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
+    for guess in chain([guesses.nearest], islice(guesses.to_other_ends(), 1)):
         elastic = soft.solve(guess.stages)
-        missed = list_shortfalls(search, elastic.stages)
-        if elastic.success and not missed:
+        shortfalls = list_shortfalls(search, elastic.stages)
+        if elastic.success and not shortfalls:
             # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
             solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if solution is not None:
                 return solution
         elif elastic.success:
-            short.append(elastic.stages)
-    if not short:
+            infeasible.append(elastic.stages)
+    if not infeasible:
         refuse_paths(search, [margin for margin, _ in guesses.paths])
-    raise explain_stages(search, short, replan, missed)
+    raise explain_stages(search, infeasible, replan, shortfalls)
 
 
 def list_plans(search: TimeSearch, solution: TimeSolution) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase."""
-    problem, plans, first = search.source, list[PhasePlan[TimeMotion]](), search.tried
-    least = problem.epsilon + problem.scene.scales.force * solution.margin
+    problem, plans, statistics = search.source, list[PhasePlan[TimeMotion]](), search.statistics
+    least_force = problem.epsilon + problem.scene.scales.force * solution.margin
     stages = [to_si(stage, problem) for stage in solution.stages]
     motions = make_phase_motions(stages, search.scheme)
     for phase, motion in zip(search.phases, motions, strict=True):
-        value = value_of(search.options, motion.duration, motion.torque, least)
+        value = value_of(search.options, motion.duration, motion.torque, least_force)
         of_phase = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=solution.attempt, stages=of_phase)
         plans.append(plan._replace(error=solution.error))
-    plans[0] = plans[0]._replace(sequences=first.sequences, complete=first.complete)
+    plans[0] = plans[0]._replace(sequences=statistics.sequences, complete=statistics.complete)
     return plans
 
 
@@ -616,40 +615,40 @@ def plan_with_impacts(
     z: Array,
     options: PlanOptions,
     duration: float | None,
-    **given: Any,
+    **arguments: Any,
 ) -> Plans:
-    """Plan a block with the impacts that are possible, or else with stops.
+    """Plans of a block with the impacts that are possible, or else with stops.
 
-    The arguments are those of `plan_phases`; with impacts `ample`, `fastest` and `free` count.
+    `arguments` of `plan_phases`; with impacts `saturation`, `fastest` and `free_plans` count.
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        return [*plan_phases(problem, block, z, options, duration, **given)]
-    fastest: Sequence[PhasePlan[Motion]] = given["fastest"]
-    direct = partial(plan_part, problem, block, ample=given["ample"], free=given["free"])
-    thorough = partial(direct, thorough=True)
-    with_stops = partial(plan_stops, thorough, [0, *ends, len(block)], z)
-    slow = AT_REST * problem.scene.scales.speed
+        return [*plan_phases(problem, block, z, options, duration, **arguments)]
+    fastest: Sequence[PhasePlan[Motion]] = arguments["fastest"]
+    common = {name: arguments[name] for name in ("saturation", "free_plans")}
+    direct = partial(plan_part, problem, block, **common)
+    with_stops = partial(plan_stops, partial(direct, thorough=True), [0, *ends, len(block)], z)
+    rest_speed = AT_REST * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
-    if duration is not None and fastest and max(speeds) < slow:
+    if duration is not None and fastest and max(speeds) < rest_speed:
         # Without an impact in least time there is none in a longer duration.
         return with_stops(options, duration)
-    # A duration that is too short for stops need not be so without them.
-    fast = replace(options, objective=Objective.TIME, duration=None)
-    blocked, failure = list[int](), None
+    # A duration that is too short with stops may be long enough without them.
+    time_options = replace(options, objective=Objective.TIME, duration=None)
+    stops, failure = list[int](), None
     try:
-        stopped = with_stops(options if duration is None else fast)
-        impacts = [_impact_at_stop(block[k - 1], block[k], stopped[k - 1]) for k in ends]
-        blocked = [k for k, impact in zip(ends, impacts, strict=True) if impact.violations]
+        stop_plans = with_stops(options if duration is None else time_options)
+        impacts = [_impact_at_stop(block[k - 1], block[k], stop_plans[k - 1]) for k in ends]
+        stops = [k for k, impact in zip(ends, impacts, strict=True) if impact.violations]
     except (InfeasibleError, SolverError) as error:
-        # No motion may come to rest where one passes at speed: phase 3 of new polygon 22.
+        # A motion may pass a place where none comes to rest: phase 3 of new polygon 22.
         failure = error
-    if len(blocked) < len(ends):
+    if len(stops) < len(ends):
         with suppress(InfeasibleError, SolverError):
-            return plan_stops(direct, [0, *blocked, len(block)], z, options, duration)
+            return plan_stops(direct, [0, *stops, len(block)], z, options, duration)
     if failure is not None:
         raise failure
-    return stopped if duration is None else with_stops(options, duration)
+    return stop_plans if duration is None else with_stops(options, duration)
 
 
 def plan_part(
@@ -657,18 +656,20 @@ def plan_part(
     block: Sequence[Phase],
     start: int,
     stop: int,
-    *given: Any,
-    free: Sequence[PhasePlan[Motion]] = (),
+    z: Array,
+    options: PlanOptions,
+    duration: float | None,
+    free_plans: Sequence[PhasePlan[Motion]] = (),
     thorough: bool = False,
-    **others: Any,
+    **arguments: Any,
 ) -> Plans:
-    """Plan phases `start` to `stop` of a block, without the latter; as of `plan_phases`."""
-    phases, others = block[start:stop], others | {"free": free[start:stop], "thorough": thorough}
-    return [*plan_phases(problem, phases, *given, **others)]
+    """Plan phases `start` to `stop` of a block, without the latter, by `plan_phases`."""
+    arguments |= {"free_plans": free_plans[start:stop], "thorough": thorough}
+    return [*plan_phases(problem, block[start:stop], z, options, duration, **arguments)]
 
 
 def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[Transition]:
-    """The impacts of a block, at speed or with a stop."""
+    """The impacts of a block, passed at speed or with a stop."""
     transitions = []
     for k, (phase, plan) in enumerate(zip(block, plans, strict=True), start=1):
         if phase.end is not End.IMPACT:
@@ -688,7 +689,7 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
 
 
 def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
-    """The impact for unit speed in the direction in which a phase comes to its stop."""
+    """The impact at unit speed in the direction in which a phase comes to rest."""
     v = plan.motion.evaluate(np.array([plan.motion.duration * (1 - 1e-3)])).z_dot[0]
     v = v / measure_speed(phase.formation.scene, v)
     return compute_impact(phase.formation, following.formation, end_of(plan)[0], v)
