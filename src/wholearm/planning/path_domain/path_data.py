@@ -22,8 +22,8 @@ from ...results.torque import TorqueProfile
 from ..robust.robust_rows import COPIES, RobustLimits, evaluate_robust, repeat_limits, widen
 from .path_motion import Elements, Grid, PathMotion, Profile
 
-PLACES = 13  # interpolation points where torques of a motion are not those through the knots
-LOOKS = 21  # samples of torque rates in each interval
+KNOTS = 13  # interpolation points where torques of a motion are not those through the knots
+RATE_SAMPLES = 21  # samples of torque rates in each interval
 
 
 class Sampling(NamedTuple):
@@ -34,7 +34,7 @@ class Sampling(NamedTuple):
 
 
 class Places(NamedTuple):
-    """What limits at n places of a curve follow from."""
+    """Coefficients of the limited values at n places of a curve."""
 
     values: Array  # (n, m, 5): coefficients of the limited values, of (1, s'', s'^2, s', lambda)
     rates: Array  # (n, 2): d theta / ds
@@ -56,7 +56,7 @@ class PhaseData(NamedTuple):
     nodes: Places  # at the nodes
     sampling: Sampling
     checks: Places  # at the checks of every solid interval, interval by interval
-    spread: RobustLimits | None = None  # robust force limits, if there are ranges
+    robust: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
     def torque_limit(self) -> Array:
@@ -75,9 +75,9 @@ class PhaseData(NamedTuple):
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
         values = apply(places.values, *profile)
-        if self.spread is not None:
-            rows, least = self.limits.of(PRESS, CONE), evaluate_robust(places.variations, profile)
-            values[:, rows] = np.repeat(least, COPIES, axis=1)
+        if self.robust is not None:
+            rows, worst = self.limits.of(PRESS, CONE), evaluate_robust(places.variations, profile)
+            values[:, rows] = np.repeat(worst, COPIES, axis=1)
         return values
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
@@ -94,27 +94,27 @@ class PhaseData(NamedTuple):
         """The profile at `fractions` of every solid interval, interval by interval."""
         return Elements(self.grid, profile).at(fractions)
 
-    def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
+    def find_violations(self, profile: Profile, margin: float) -> tuple[Array, Array]:
         """Violations in each solid interval, (n_solid, n_sides) [N, N m]; of b, relatively."""
-        here = self.interpolate(profile, self.sampling.checks)
-        speed_slack = 1 - here.b / self.largest_b(self.checks)
-        slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
+        samples = self.interpolate(profile, self.sampling.checks)
+        speed_slack = 1 - samples.b / self.largest_b(self.checks)
+        slack = np.column_stack([self.slack(self.checks, samples, margin), speed_slack])
         least = find_minima(slack.reshape(-1, len(self.sampling.checks), slack.shape[1]))
-        short = np.maximum(-least, 0.0)
-        return short[:, :-1], short[:, -1]
+        violations = np.maximum(-least, 0.0)
+        return violations[:, :-1], violations[:, -1]
 
-    def spread_to_nodes(self, inside: Array) -> Array:
+    def move_to_nodes(self, values: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
-        table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty
-        table[k] = inside
-        table[k + 1] = np.maximum(table[k + 1], inside)
-        return table
+        at_nodes, k = np.zeros((len(self.grid.s), *values.shape[1:])), self.grid.nonempty
+        at_nodes[k] = values
+        at_nodes[k + 1] = np.maximum(at_nodes[k + 1], values)
+        return at_nodes
 
 
 def prepare(
-    curve: Curve, epsilon: float, grid: Grid, phase: int, spread: RobustLimits | None = None
+    curve: Curve, epsilon: float, grid: Grid, phase: int, robust: RobustLimits | None = None
 ) -> PhaseData:
-    """Evaluate inverse dynamics and limits, with a `spread` robust ones, along a curve.
+    """Evaluate inverse dynamics and limits, with `robust` also robust ones, along a curve.
 
     Raises
     ------
@@ -123,10 +123,10 @@ def prepare(
     """
     nonempty = grid.nonempty
     sampling = choose_sampling(len(grid.s))
-    inner = sampling.knots[1:-1]
-    between = (grid.s[nonempty, None] + inner * grid.steps[nonempty, None]).ravel()
-    s = np.concatenate([grid.s, between])
-    segment = np.concatenate([grid.segment, np.repeat(grid.segment[nonempty], len(inner))])
+    inner_knots = sampling.knots[1:-1]
+    s_knots = (grid.s[nonempty, None] + inner_knots * grid.steps[nonempty, None]).ravel()
+    s = np.concatenate([grid.s, s_knots])
+    segment = np.concatenate([grid.segment, np.repeat(grid.segment[nonempty], len(inner_knots))])
     point = curve.evaluate(s)
     formation, directions = curve.formation, directions_of(curve, segment)
     inertia = reduced_inertia(formation, point.kinematics, directions)
@@ -143,36 +143,36 @@ def prepare(
     forces, rates = inverse(formation, point, directions), point.z_s[:, 3:]
     limits, speeds = make_limits(formation, epsilon).split(2)
     variations = np.zeros((len(s), 0))
-    if spread is not None:
-        variations = spread.find_variations(formation, point, directions, forces, epsilon)
-    every = Places(find_value_rows(limits, forces, rates), rates, variations)
-    added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
-    rows = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel()
+    if robust is not None:
+        variations = robust.find_variations(formation, point, directions, forces, epsilon)
+    all_places = Places(find_value_rows(limits, forces, rates), rates, variations)
+    knot_rows = len(grid.s) + np.arange(len(s_knots)).reshape(len(nonempty), -1)
+    rows = np.hstack([nonempty[:, None], knot_rows, nonempty[:, None] + 1]).ravel()
 
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
     to_checks, to_knots = (
         (2 * places[:, None] - 1) ** np.arange(len(sampling.knots))
         for places in (sampling.checks, sampling.knots)
     )
-    through = to_checks @ np.linalg.inv(to_knots)
+    matrix = to_checks @ np.linalg.inv(to_knots)
 
     def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
-        return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
+        return (matrix @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
-    nodes = every.pick(slice(None, len(grid.s)))
-    checks = Places(*map(interpolate, every.pick(rows)))
-    if spread is not None:
+    nodes = all_places.pick(slice(None, len(grid.s)))
+    checks = Places(*map(interpolate, all_places.pick(rows)))
+    if robust is not None:
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
-        at = (grid.s, grid.segment), (interpolate(s[rows]), owners)
+        positions = (grid.s, grid.segment), (interpolate(s[rows]), owners)
         nodes, checks = (
             places._replace(
-                values=widen(limits, places.values, places.variations, spread.pick_signs(*each))
+                values=widen(limits, places.values, places.variations, robust.pick_signs(*where))
             )
-            for places, each in zip((nodes, checks), at, strict=True)
+            for places, where in zip((nodes, checks), positions, strict=True)
         )
         limits = repeat_limits(limits)
-    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, checks, spread)
+    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, checks, robust)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -216,7 +216,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
         raise SolverError("the motion all but stops between two nodes; plan with more intervals")
     torque, misfit = _fit(data, motion.profile, spans, count)
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        torque = TorqueProfile.fit(torque.breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
+        torque = TorqueProfile.fit(torque.breaks, lambda t: motion.evaluate(t).tau, KNOTS - 1)
     return torque
 
 
@@ -225,21 +225,21 @@ def find_torques(
 ) -> tuple[Array, Array]:
     """Torques and their rates, (n_solid, 2, LOOKS) [N m, N m/s], at evenly spaced times."""
     spans = np.concatenate([motion.durations(data.sampling.checks) for motion in motions])
-    torque, _ = _fit(data, profile, spans, PLACES)
-    looks = np.linspace(-1, 1, LOOKS)
-    return torque.at_places(looks), torque.slopes.at_places(looks)
+    torque, _ = _fit(data, profile, spans, KNOTS)
+    samples = np.linspace(-1, 1, RATE_SAMPLES)
+    return torque.at_places(samples), torque.slopes.at_places(samples)
 
 
 def _fit(
-    data: PhaseData, profile: Profile, spans: Array, least: int
+    data: PhaseData, profile: Profile, spans: Array, min_count: int
 ) -> tuple[TorqueProfile, Array]:
-    """Polynomials in time through torques at `least` checks or more, and errors at all, (n, m, 2).
+    """Polynomials in time through torques at `min_count` checks or more; all errors, (n, m, 2).
 
     The checks of each interval are `spans` after its start, (n, m) [s].
     """
     of_tau = data.checks.values[:, data.limits.of(TORQUE)]
     tau = apply(of_tau, *data.interpolate(profile, data.sampling.checks))
-    tau, step = tau.reshape(*spans.shape, 2), (spans.shape[1] - 1) // (least - 1)
+    tau, step = tau.reshape(*spans.shape, 2), (spans.shape[1] - 1) // (min_count - 1)
     x = 2 * spans / spans[:, -1:] - 1
     powers = x[..., None] ** np.arange(len(x[0, ::step]))
     coefficients = np.linalg.solve(powers[:, ::step], tau[:, ::step])
