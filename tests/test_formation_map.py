@@ -37,7 +37,7 @@ from wholearm.mapping.formation_map import (
     time_borders,
 )
 from wholearm.mechanics.speed_sweep import NoMotionError
-from wholearm.planning.lower_bound import look_along
+from wholearm.planning.lower_bound import sweep_time
 from wholearm.problem.read import read_problem
 from wholearm.scene.model import Finger
 from wholearm.search.edges import Edge
@@ -564,7 +564,7 @@ def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
         back = replace(back, length=forth.length, reached=True)
         for own in (forth, back):
             try:
-                expected.append(look_along((own,), problem.epsilon, 100))
+                expected.append(sweep_time((own,), problem.epsilon, 100))
             except NoMotionError:
                 expected.append(math.inf)
     found = time_borders(problem, [make_border(curve) for curve in curves])

@@ -30,7 +30,7 @@ from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, forward, inverse, 
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
 from wholearm.mechanics.path_limits import InternalForceLimits, PathLimits, find_speed_cap
 from wholearm.planning.explain import change_limit, list_shortfalls
-from wholearm.planning.lower_bound import bound_least_time, look_along
+from wholearm.planning.lower_bound import bound_least_time, sweep_time
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import choose_sampling, prepare
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -136,7 +136,7 @@ def test_another_limit_binds_along_a_curve(
     assert driven.value > 1.001 * plain.value
     # The check between nodes sees it where it was not kept.
     data = prepare(curve, EPSILON, plain.motion.grid, 2)
-    short = data.limits.fold(data.misses(plain.motion.profile, 0.0)[0]).max(axis=0)
+    short = data.limits.fold(data.find_violations(plain.motion.profile, 0.0)[0]).max(axis=0)
     (missed,) = {data.limits.limits[k].kind for k in data.limits.owners[short > 1e-6]}
     assert missed == "motor"
     assert short.max() == pytest.approx(2.0 * (before - 1), rel=1e-2)
@@ -243,7 +243,7 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
         (part,), whole = time_parts(border, np.ones(1)), estimate_duration([border.limits], [1.0])
         of_border = whole, part
         of_cell = time_paths(formation.scene, epsilon, *path)[0]
-        return np.array([least.value, look_along([curve], EPSILON, 50), *of_border, of_cell])
+        return np.array([least.value, sweep_time([curve], EPSILON, 50), *of_border, of_cell])
 
     plain = measure(EPSILON)
     s = np.linspace(0.2, 0.8, 7) * curve.length

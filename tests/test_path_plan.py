@@ -31,7 +31,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, inverse
 from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning.blocks import ImpactSequence
-from wholearm.planning.lower_bound import LowerBound, bound_least_time, look_along
+from wholearm.planning.lower_bound import LowerBound, bound_least_time, sweep_time
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -276,7 +276,7 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
     def build(shape: LimitShape, intervals: int, goal: Objective) -> PathNLP:
         nlp = original(shape, intervals, goal)
         stopped = Stopped(nlp.solver.function)
-        return replace(nlp, solver=stopped, starter=stopped) if goal is Objective.TIME else nlp
+        return replace(nlp, solver=stopped, start_solver=stopped) if goal is Objective.TIME else nlp
 
     monkeypatch.setattr(path_plan, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
@@ -493,14 +493,14 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid() -> None:
         assert found is not None
         least.append(found.value)
     assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)
-    assert look_along(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)
+    assert sweep_time(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)
     # Nor does the search for routes give up the border on which it lies.
     slow = curves[1]
     place = make_place(slow.formation.scene, slow.start)
     edge = Chain((BorderEdge(place, slow, epsilon, 0.1),)).stop_at(Until())
     # A crawl through that place on the first grid is a tenth too slow; 1 would be no estimate.
     assert isinstance(edge, Edge) and edge.estimate == pytest.approx(
-        look_along([slow], epsilon, 1000), rel=0.2
+        sweep_time([slow], epsilon, 1000), rel=0.2
     )
 
 
@@ -516,10 +516,10 @@ def test_a_place_narrower_than_the_grid_may_need_more_speed(lever: float, passes
     with toy.in_place():
         if passes:
             # The largest speed there, sqrt(2), is that without the place.
-            assert look_along([toy.curve], toy.epsilon, 24) == pytest.approx(math.sqrt(2), rel=0.01)
+            assert sweep_time([toy.curve], toy.epsilon, 24) == pytest.approx(math.sqrt(2), rel=0.01)
         else:
             with pytest.raises(NoMotionError):
-                look_along([toy.curve], toy.epsilon, 24)
+                sweep_time([toy.curve], toy.epsilon, 24)
 
 
 def test_torques_follow_a_motion_that_fades() -> None:

@@ -489,7 +489,7 @@ def test_without_an_accurate_robust_plan_there_is_a_rough_one(
     curves: tuple[Curve, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stall(first: path_plan.PathIterate, accuracy: float) -> path_plan.PathIterate:
-        return refine(first, accuracy, 40 if accuracy >= 1e-2 or not first.task.guides else 0)
+        return refine(first, accuracy, 40 if accuracy >= 1e-2 or not first.task.references else 0)
 
     monkeypatch.setattr(path_plan, "refine", stall)
     plan = plan_path(curves[0], EPSILON, PlanOptions(ranges=RADII, accuracy=1e-6), 1)

@@ -103,7 +103,7 @@ class Toy:
             patch.setattr(path_motion, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             # A toy has no shape that friction could hold at rest.
-            patch.setattr(path_plan, "find_sure_start", lambda *_: None)
+            patch.setattr(path_plan, "find_moving_start", lambda *_: None)
             yield
 
     def _inverse(self, _: Any, point: CurvePoint, directions: Directions) -> PathForces:

@@ -69,7 +69,7 @@ class Curve:
     panels: tuple[Panel, ...]
     length: float  # [m]
     ending: str  # what happens at the end, in words
-    reached: bool  # whether that is what the curve was traced for
+    reached: bool  # whether the curve ends at the requested end
     # arc length per unit of the parameter s, hence the length of its tangents
     speed_ratio: float = 1.0
 
@@ -88,18 +88,18 @@ class Curve:
         owner = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
         z, tangent = np.empty((len(s), 5)), np.empty((len(s), 5))
         for index, panel in enumerate(self.panels):
-            mine = owner == index
-            if mine.any():
-                z[mine], tangent[mine] = panel.interpolate(s[mine])
+            rows = owner == index
+            if rows.any():
+                z[rows], tangent[rows] = panel.interpolate(s[rows])
         return z, tangent
 
     def with_speed_ratio(self, ratio: float) -> Curve:
         """Return the same curve with a parameter that runs through it at another ratio."""
         if ratio == self.speed_ratio:
             return self
-        share = self.speed_ratio / ratio
-        panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        return replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
+        factor = self.speed_ratio / ratio
+        panels = tuple(Panel(factor * panel.s, panel.z, panel.z_s) for panel in self.panels)
+        return replace(self, panels=panels, length=factor * self.length, speed_ratio=ratio)
 
     @property
     def start(self) -> Array:
@@ -148,10 +148,10 @@ class Curve:
         ends = [0.0, *(s for i, s in enumerate(inner) if i == 0 or s > inner[i - 1] + margin)]
         segments = []
         for start, stop in zip(ends, [*ends[1:], self.length], strict=True):
-            within = rates[(grid > start) & (grid < stop)]
-            if not len(within):
-                within = self.sliding(np.array([(start + stop) / 2]))
-            signs = np.sign(within[np.abs(within).argmax(axis=0), range(rates.shape[1])])
+            inner_rates = rates[(grid > start) & (grid < stop)]
+            if not len(inner_rates):
+                inner_rates = self.sliding(np.array([(start + stop) / 2]))
+            signs = np.sign(inner_rates[np.abs(inner_rates).argmax(axis=0), range(rates.shape[1])])
             segments.append(Segment(start, stop, signs[:-2], signs[-2:]))
         return tuple(segments)
 
@@ -194,9 +194,9 @@ def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
     if formation.n_constraints != 3:
         return flush
     rates = find_rates(formation, z)
-    sizes = np.linalg.norm(rates, axis=1)
-    across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
-    tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
+    norms = np.linalg.norm(rates, axis=1)
+    cross_products = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
+    tied = (cross_products < _TIED * norms * norms[row]) & (norms > _TIED) & (norms[row] > _TIED)
     return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
 
 
@@ -208,14 +208,14 @@ def find_vanishing(formation: Formation, z: Array) -> tuple[int, ...]:
 
 def find_rates(formation: Formation, z: Array) -> Array:
     """Rates of (contacts, joints) in each free direction, (n_c + 2, n), over the largest one."""
-    at, metric = formation.evaluate(z[None], np.zeros((1, 5))), metric_weights(formation.scene)
-    rows = np.vstack([at.A_t[0] / formation.scene.scales.length, np.eye(5)[3:]])
-    rates = rows @ find_freedoms(at.P[0], metric, 1e-9)
+    place, metric = formation.evaluate(z[None], np.zeros((1, 5))), metric_weights(formation.scene)
+    rows = np.vstack([place.A_t[0] / formation.scene.scales.length, np.eye(5)[3:]])
+    rates = rows @ find_freedoms(place.P[0], metric, 1e-9)
     return np.asarray(rates / np.linalg.norm(rates, axis=1).max(initial=1e-300))
 
 
 def refine(s: Array, stop: float) -> Array:
-    """Places to look at along a panel with nodes `s`, up to `stop`: three for each node."""
+    """Samples along a panel with nodes `s`, up to `stop`: three for each node."""
     grid = np.interp(np.linspace(0, len(s) - 1, 3 * len(s)), np.arange(len(s)), s)
     return np.append(grid[grid < stop], min(stop, s[-1]))
 

@@ -21,10 +21,10 @@ from ..problem.definition import Phase
 from .curve import tangent_basis
 from .tracing import require_touching, runs_on_curve, trace_phase
 
-GRID = (120, 60)  # places across x and phi at which a formation is looked at
-STILL = 1e-4  # distance from the start, in radii of gyration, that counts as none
+GRID = (120, 60)  # samples of x and phi of a formation
+MIN_DISTANCE = 1e-4  # distance from the start, in radii of gyration, that counts as none
 POINTS = 25  # configurations along a guess
-RELEASE_AT = 0.8  # share of a curve at which a release is guessed
+RELEASE_AT = 0.8  # fraction of a curve at which a release is guessed
 
 
 def is_inside(formation: Formation, z: Array) -> bool:
@@ -34,7 +34,7 @@ def is_inside(formation: Formation, z: Array) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """What has to hold where a phase ends."""
+    """Conditions at the end of a phase."""
 
     formation: Formation  # contacts that are closed
     fixed: Fixed = ()  # rows of z and the values that they have to take
@@ -43,13 +43,13 @@ class Ending:
     def measure(self, z: Array) -> Array:
         """How far configurations with the phase's own contacts closed are from the end [m]."""
         metric = metric_weights(self.formation.scene)
-        off = np.abs(self.formation.evaluate(z, z).C).max(axis=1)
+        distance = np.abs(self.formation.evaluate(z, z).C).max(axis=1)
         for row, value in self.fixed:
-            off = np.maximum(off, np.abs(z[:, row] - value) * np.sqrt(metric[row]))
+            distance = np.maximum(distance, np.abs(z[:, row] - value) * np.sqrt(metric[row]))
         if self.active:
             limits = self.formation.evaluate_limits(z)[:, list(self.active)]
-            off = np.maximum(off, np.abs(limits).max(axis=1))
-        return np.asarray(off)
+            distance = np.maximum(distance, np.abs(limits).max(axis=1))
+        return np.asarray(distance)
 
 
 def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
@@ -69,8 +69,8 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
             if goal is None or not is_inside(end.formation, goal):
                 continue
             distance = float(np.sqrt(metric @ (goal - z) ** 2))
-            # One that holds at the start is no end to go to.
-            if STILL * formation.scene.scales.length < distance < least:
+            # An end that holds at the start is left out.
+            if MIN_DISTANCE * formation.scene.scales.length < distance < least:
                 nearest, least = goal, distance
     return nearest
 

@@ -116,8 +116,8 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
         ends = [*(p.until for p in later if not p.until.is_release), until]
         curves = [trace_curve(formation, z, v, until) for v in _headings(formation, z, ends[0])]
         curve, least = max(curves, key=lambda curve: curve.length), HELD * rho
-        same = later and set(later[0].formation.contacts) == set(formation.contacts)
-        if same and curves[0].length >= least:
+        same_contacts = later and set(later[0].formation.contacts) == set(formation.contacts)
+        if same_contacts and curves[0].length >= least:
             # Only modes change, anywhere on the path to the next end of a phase.
             curve = curves[0]
         if curve.length < least:
@@ -125,13 +125,13 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
         return curve
     if _holds(formation, until, z):
         raise InputError("", f"{key}.until", f"{until} holds already at the start of the phase")
-    reason = []
+    endings = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
         if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and curve.is_regular:
             return curve
-        reason.append(curve.ending)
-    text = f"going one way {reason[0]}, going the other way {reason[1]}"
+        endings.append(curve.ending)
+    text = f"going one way {endings[0]}, going the other way {endings[1]}"
     text += "; one freedom leaves no choice" if until.pins else ""
     raise InputError("", f"{key}.until", f"{until} is never reached: {text}")
 
@@ -164,11 +164,11 @@ def _holds(formation: Formation, until: Until, z: Array) -> bool:
 
 def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
     """Both unit tangents at `z`, the one that approaches `until` first."""
-    null, back = find_headings(formation, z, 0.0)
+    null, opposite = find_headings(formation, z, 0.0)
     step = 1e-6 * formation.scene.polygon.gyration_radius
     places = np.array([z, z + step * null])
-    here, ahead = np.abs(EndDistance(formation.scene, until, z).measure(places))
-    return [null, back] if ahead <= here else [back, null]
+    distance, next_distance = np.abs(EndDistance(formation.scene, until, z).measure(places))
+    return [null, opposite] if next_distance <= distance else [opposite, null]
 
 
 def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[Array, ...]:
@@ -185,21 +185,21 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     """Trace a curve with four constraints from `z` along `heading`, (5,), to `until` or its end."""
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
-    wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
-    # What is closed from the start, such as the end of a flush edge that the link does not reach
-    # yet, does not end the phase.
+    targets = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    # A limit that is closed at the start, such as the end of a flush edge that the link does not
+    # reach yet, does not end the phase.
     closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
-    wanted = [k for k in wanted if not closed[k]] or wanted
-    wanted = [len(names) - 1] if until.contact is None else wanted
+    targets = [k for k in targets if not closed[k]] or targets
+    targets = [len(names) - 1] if until.contact is None else targets
     end_distance = EndDistance(formation.scene, until, z)
 
     panels: list[Panel] = []
-    first = np.zeros(len(formation.limits))  # limits below zero where the curve begins [rho]
+    offset = np.zeros(len(formation.limits))  # limits below zero where the curve begins [rho]
 
     def margins(points: Array) -> Array:
         # Where a contact is gained is among the limits.
-        left = end_distance.measure(points) if until.contact is None else np.ones(len(points))
-        return np.column_stack([formation.evaluate_limits(points) / rho - first, left])
+        distance = end_distance.measure(points) if until.contact is None else np.ones(len(points))
+        return np.column_stack([formation.evaluate_limits(points) / rho - offset, distance])
 
     def end(s: float, text: str, reached: bool = False) -> Curve:
         return Curve(formation, tuple(panels), s, text, reached)
@@ -215,15 +215,15 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
             continue
         panels.append(panel)
         if len(panels) == 1:
-            # A plan ends at a crossing to its own tolerance: what is closed there counts from
+            # A plan ends at a crossing to its own tolerance: limits closed there are measured from
             # there. Case: phase 5 of `heptagon.toml` with periods of 5 ms, v0-finger2 9e-10 below.
             values = formation.evaluate_limits(panel.z[:1])[0] / rho
-            first = np.clip(values, -TOUCHING, 0.0)
+            offset = np.clip(values, -TOUCHING, 0.0)
         crossing = find_crossing(panel, margins)
         if crossing is not None:
             s, active = crossing
             place = describe_pose(panel.interpolate(np.array([s]))[0][0])
-            reached = [k for k in active if k in wanted]
+            reached = [k for k in active if k in targets]
             return end(s, f"{names[(reached or active)[0]]} at {place}", bool(reached))
         start, z, tangent = panel.s[-1], panel.z[-1], panel.z_s[-1]
     return end(start, f"nothing happens up to {describe_pose(z)}")
@@ -251,8 +251,8 @@ class EndDistance:
         The bend is what the velocity alone adds to its second derivative.
         """
         if self.gained is not None:
-            at = self.gained.evaluate(z, v)
-            return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
+            kinematics = self.gained.evaluate(z, v)
+            return kinematics.C[:, 0], kinematics.A[:, 0], kinematics.P_dot_v[:, 0]
         gradient = np.zeros(z.shape)
         gradient[:, self.row] = self.side
         return self.side * (z[:, self.row] - self.value), gradient, np.zeros(len(z))
@@ -277,17 +277,17 @@ def find_crossing(
         grid = np.append(grid, inner)
         order = grid.argsort()
         grid, values = grid[order], values[order]
-    # What starts closed (the contact just given up) has to open; rounding is not closing.
-    broken = values < -ROUNDING
-    if not broken.any():
+    # A contact that is closed at the start (just released) has to open; rounding is not closing.
+    violated = values < -ROUNDING
+    if not violated.any():
         return None
-    row = int(broken.any(axis=1).argmax())
+    row = int(violated.any(axis=1).argmax())
     roots = {}
 
     def margin(k: int, s: float) -> float:
         return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
 
-    for k in np.flatnonzero(broken[row]):
+    for k in np.flatnonzero(violated[row]):
         if row == 0 or values[row - 1, k] <= 10 * ROUNDING:
             roots[int(k)] = float(grid[max(row - 1, 0)])
         else:
@@ -300,14 +300,14 @@ def find_crossing(
 
 def _refine_dips(grid: Array, values: Array) -> Array:
     """Samples around minima that may fall below zero: no deeper than half the second difference."""
-    before, here, after = values[:-2], values[1:-1], values[2:]
-    dips = (here <= before) & (here <= after) & (here > ROUNDING)
-    rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))
+    before, middle, after = values[:-2], values[1:-1], values[2:]
+    dips = (middle <= before) & (middle <= after) & (middle > ROUNDING)
+    rows = np.flatnonzero((dips & (middle < before - 2 * middle + after)).any(axis=1))
     if not len(rows):
         return rows.astype(float)
-    inner = np.linspace(0.0, 1.0, 14)[1:-1]
+    fractions = np.linspace(0.0, 1.0, 14)[1:-1]
     low, high = grid[rows, None], grid[rows + 2, None]
-    return np.setdiff1d(low + (high - low) * inner, grid)
+    return np.setdiff1d(low + (high - low) * fractions, grid)
 
 
 def build_panel(
@@ -324,8 +324,8 @@ def build_panel(
     points, rho = z + u[:, None] * heading, formation.scene.polygon.gyration_radius
     kinematics, size = formation.evaluate(points, points), np.inf
     for count in range(12):
-        slid = formation.evaluate_slip(points) - slip
-        residual = np.column_stack([kinematics.C, slid, (points - z) @ projection - u])
+        slip_error = formation.evaluate_slip(points) - slip
+        residual = np.column_stack([kinematics.C, slip_error, (points - z) @ projection - u])
         matrix = border(kinematics.P, projection)
         try:
             change = np.linalg.solve(matrix, -residual[..., None])[..., 0]
@@ -333,9 +333,9 @@ def build_panel(
             return None, SHORTER
         points = points + change
         kinematics = formation.evaluate(points, points)
-        before, size = size, np.abs(change * np.sqrt(metric)).max()
+        last_size, size = size, np.abs(change * np.sqrt(metric)).max()
         # The next change is about the square of this one.
-        if size < 3e-8 * rho or size > 10 * rho or (count > 2 and size > before / 2):
+        if size < 3e-8 * rho or size > 10 * rho or (count > 2 and size > last_size / 2):
             break
     if not size < 3e-8 * rho:
         return None, SHORTER
@@ -373,6 +373,6 @@ class CostToGo:
         curve = trace_phase(self.phase, z)
         step = 1e-2 * curve.length
         point = curve.evaluate(np.array([0.0, step]))
-        here, next_value = (self.value(place) for place in point.z)
-        slope = (next_value - here) / step
-        return here, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]
+        value, next_value = (self.value(place) for place in point.z)
+        slope = (next_value - value) / step
+        return value, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]

@@ -25,7 +25,7 @@ from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
-from ..geometry.path_guess import STILL, find_end, guess_phase, is_inside
+from ..geometry.path_guess import MIN_DISTANCE, find_end, guess_phase, is_inside
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import measure_speed
 from ..problem.definition import Phase, Problem, Until
@@ -224,7 +224,7 @@ def _follow_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> l
             for contacts, until in steps:
                 start = end
                 end = find_end(Phase(index + len(phases), Formation(scene, contacts), until), start)
-                if measure_speed(scene, end - start) < STILL * scene.scales.length:
+                if measure_speed(scene, end - start) < MIN_DISTANCE * scene.scales.length:
                     text = f"{until} holds already at {describe_pose(start)}"
                     raise InputError("", "", text)
                 stretch = Stretch(contacts, until, start[[0, 2]], end[[0, 2]])

@@ -26,7 +26,7 @@ from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import InternalForceLimits, PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
-from ..planning.lower_bound import GIVE
+from ..planning.lower_bound import RELAXATION
 from ..problem.definition import ROWS, Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, cut, label_inside, list_tracks, name_contacts
@@ -322,7 +322,7 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
         directions = Directions.of(point.kinematics, point.z_s)
         forces = inverse(formation, point, directions)
         limits = make_limits(formation, problem.epsilon)
-        rows, cap = PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
+        rows, cap = PathLimits.of(limits, forces, point.z_s[:, 3:], RELAXATION).eliminate()
         inertia = reduced_inertia(formation, point.kinematics, directions)
         ratios = find_minors(formation, point.kinematics, directions.Xi).ratios
         # b <= 0: no motion.

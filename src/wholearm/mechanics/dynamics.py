@@ -61,16 +61,22 @@ class PathForces(NamedTuple):
 
     def c(self, a: Array, b: Array, internal: Array) -> Array:
         """Contact forces, shape (n, n_c + R) [N], for a, b and lambda of shape (n,)."""
-        return np.asarray(np.einsum("nij,nj->ni", self.of_c, stack_motion(a, b, internal)))
+        return apply(self.of_c, a, b, internal)
 
     def tau(self, a: Array, b: Array, internal: Array) -> Array:
         """Joint torques, shape (n, 2) [N m], for a, b and lambda of shape (n,)."""
-        return np.asarray(np.einsum("nij,nj->ni", self.of_tau, stack_motion(a, b, internal)))
+        return apply(self.of_tau, a, b, internal)
 
 
 def stack_motion(a: Array, b: Array, internal: Array) -> Array:
     """Factors of the coefficients: (1, a, b, s', lambda), shape (n, 5)."""
     return np.stack([np.ones_like(b), a, b, np.sqrt(np.maximum(b, 0.0)), internal], axis=-1)
+
+
+def apply(coefficients: Array, a: Array, b: Array, internal: Array) -> Array:
+    """Values of coefficients, (n, ..., 5), for motions a, b and lambda of shape (n,)."""
+    motion = stack_motion(a, b, internal)
+    return np.asarray(np.einsum("n...q,nq->n...", coefficients, motion))
 
 
 def forward(

@@ -35,7 +35,6 @@ class MotionLimit:
     scale: float  # unit of shortfalls
     parameter: Parameter  # the number whose change relaxes the limit
     weight: Array  # (r,): relaxation of the bounds per unit of the parameter
-    viscous: bool = False  # whether its forces depend on s', and not only on s'^2
 
 
 @dataclass(frozen=True, eq=False)

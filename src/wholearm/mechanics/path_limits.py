@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.arrays import Array, Flags, Numbers
 from ..contacts.formation import Formation
-from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
+from .dynamics import LAMBDA, ONE, A, B, PathForces, V, apply
 from .limits import EPSILON, PRESS, LimitSet, make_limits
 
 TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
@@ -38,15 +38,15 @@ class PathLimits(NamedTuple):
     cap: Array  # (...,) [m^2/s^2]: largest b by joint speeds, infinite without speed limits
 
     @staticmethod
-    def of(limits: LimitSet, forces: PathForces, rates: Array, give: float = 0.0) -> PathLimits:
+    def of(limits: LimitSet, forces: PathForces, rates: Array, amount: float = 0.0) -> PathLimits:
         """Limits of a set at n places with d theta / ds = `rates`, (n, 2).
 
-        They are relaxed by `give`, over their scales.
+        They are relaxed by `amount`, over their scales.
         """
         bounds, speeds = limits.split(2)
-        rows = find_slack_rows(bounds, forces, rates)
-        rows[..., ONE] += give
-        return PathLimits(rows, (1 + give) * find_speed_cap(speeds, rates))
+        rows = find_slack_rows(bounds, find_value_rows(bounds, forces, rates))
+        rows[..., ONE] += amount
+        return PathLimits(rows, (1 + amount) * find_speed_cap(speeds, rates))
 
     def pick(self, index: Any) -> PathLimits:
         """Return the places that `index` selects."""
@@ -59,7 +59,7 @@ class PathLimits(NamedTuple):
         return PathLimits(self.rows * np.stack(columns, axis=-1), self.cap / size[..., 0] ** 2)
 
     def relax(self, amount: Array | float) -> PathLimits:
-        """The limits with an `amount` of slack more, over their scales."""
+        """The limits with their slack increased by `amount`, over their scales."""
         rows = self.rows.copy()
         rows[..., ONE] += amount
         return self._replace(rows=rows)
@@ -69,18 +69,18 @@ class PathLimits(NamedTuple):
 
         Without any influence of lambda, as with three contacts, they are the rows themselves.
         """
-        by = self.rows[..., column]
-        if not by.any():
+        slope = self.rows[..., column]
+        if not slope.any():
             return self._replace(rows=self.rows[..., :LAMBDA])
-        i, j = np.triu_indices(by.shape[-1], 1)
-        opposite = by[..., i] * by[..., j] <= 0
-        first, second = (np.where(opposite, np.abs(by[..., k]), 0) for k in (j, i))
+        i, j = np.triu_indices(slope.shape[-1], 1)
+        opposite = slope[..., i] * slope[..., j] <= 0
+        first, second = (np.where(opposite, np.abs(slope[..., k]), 0) for k in (j, i))
         # Other pairs are 0 >= -1.
-        used = first + second > 0
-        size = np.where(used, first + second, 1)
-        one, other = (self.rows[..., k, :LAMBDA] for k in (i, j))
-        rows = ((first / size)[..., None] * one) + ((second / size)[..., None] * other)
-        rows[..., ONE] = np.where(used, rows[..., ONE], 1.0)
+        valid = first + second > 0
+        size = np.where(valid, first + second, 1)
+        row, other_row = (self.rows[..., k, :LAMBDA] for k in (i, j))
+        rows = ((first / size)[..., None] * row) + ((second / size)[..., None] * other_row)
+        rows[..., ONE] = np.where(valid, rows[..., ONE], 1.0)
         return self._replace(rows=rows)
 
     def pair(self, row: Numbers) -> Numbers:
@@ -94,10 +94,10 @@ class PathLimits(NamedTuple):
         """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have no slack."""
         k = np.arange(len(b))[:, None]
         (r1, r2), (l1, l2) = (self.rows[k, pairs, column].T for column in (A, LAMBDA))
-        one, other = self.at(b)[k, pairs].T
+        slack, other_slack = self.at(b)[k, pairs].T
         with np.errstate(divide="ignore", invalid="ignore"):
             det = r1 * l2 - r2 * l1
-            return (other * l1 - one * l2) / det, (one * r2 - other * r1) / det
+            return (other_slack * l1 - slack * l2) / det, (slack * r2 - other_slack * r1) / det
 
     def at(self, b: Array) -> Array:
         """Slack of the rows at a = 0 and lambda = 0 for b of shape (...,)."""
@@ -108,7 +108,7 @@ class PathLimits(NamedTuple):
 
     def find_slack(self, a: Array, b: Array, internal: Array) -> Array:
         """Slack of the rows for a motion of shape (n,), over their scales, shape (n, m)."""
-        return np.asarray(np.einsum("nmi,ni->nm", self.rows, stack_motion(a, b, internal)))
+        return apply(self.rows, a, b, internal)
 
     def find_internal_force_range(self, a: Array, b: Array) -> tuple[Array, Array]:
         """Least and largest lambda that the rows allow for a motion, (n,); crossed if none."""
@@ -120,12 +120,12 @@ class PathLimits(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):
             bounds = -self.at(b) / of_a
             slack = TIED * (np.abs(self.rows[..., ONE] / of_a) + np.abs(bounds))
-            lead = np.where(sign * of_a > 0, sign * bounds, -np.inf)
-            reach = np.where(sign * of_a > 0, lead + slack, -np.inf)
-            row = (reach >= lead.max(axis=1, keepdims=True)).argmax(axis=1)
+            signed = np.where(sign * of_a > 0, sign * bounds, -np.inf)
+            upper = np.where(sign * of_a > 0, signed + slack, -np.inf)
+            row = (upper >= signed.max(axis=1, keepdims=True)).argmax(axis=1)
             k = np.arange(len(b))
-            used = self.rows[k, row]
-            slope = -(used[:, B] + used[:, V] / (2 * np.sqrt(b))) / used[:, A]
+            active = self.rows[k, row]
+            slope = -(active[:, B] + active[:, V] / (2 * np.sqrt(b))) / active[:, A]
         return Extreme(bounds[k, row], slope, row)
 
     def can_rest(self, sign: float = 1.0) -> Flags:
@@ -141,32 +141,31 @@ class PathLimits(NamedTuple):
     def find_largest_b(self) -> Array:
         """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
         rows = self.eliminate(A).rows
-        one, b, v = (rows[..., k] for k in (ONE, B, V))
+        constant, b, v = (rows[..., k] for k in (ONE, B, V))
         with np.errstate(divide="ignore", invalid="ignore"):
-            root = (v + np.sqrt(np.maximum(v**2 - 4 * b * one, 0))) / (-2 * b)
+            root = (v + np.sqrt(np.maximum(v**2 - 4 * b * constant, 0))) / (-2 * b)
         largest = np.where(b < 0, np.maximum(root, 0), np.inf).min(axis=-1)
         return np.asarray(np.minimum(largest**2, self.cap))
 
 
-def find_range(by: Array, slack: Array) -> tuple[Array, Array]:
-    """Least and largest x of by x + slack >= 0, rows (..., m); crossed or infinite if none."""
+def find_range(slope: Array, slack: Array) -> tuple[Array, Array]:
+    """Least and largest x of slope x + slack >= 0, rows (..., m); crossed or infinite if none."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        bound = -slack / by
-    never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
-    low = np.where(by > 0, bound, never).max(axis=-1, initial=-np.inf)
-    return low, np.where(by < 0, bound, np.inf).min(axis=-1, initial=np.inf)
+        bound = -slack / slope
+    infeasible = np.where((slope == 0) & (slack < 0), np.inf, -np.inf)
+    low = np.where(slope > 0, bound, infeasible).max(axis=-1, initial=-np.inf)
+    return low, np.where(slope < 0, bound, np.inf).min(axis=-1, initial=np.inf)
 
 
 def find_value_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
     """Coefficients of the limited values at n places, shape (n, m, 5); see `PathLimits.of`."""
-    turn = rates[..., None] * np.eye(5)[V]
-    return np.asarray(limits.rows @ np.concatenate([forces.of_c, forces.of_tau, turn], axis=1))
+    of_rates = rates[..., None] * np.eye(5)[V]
+    return np.asarray(limits.rows @ np.concatenate([forces.of_c, forces.of_tau, of_rates], axis=1))
 
 
-def find_slack_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
-    """Coefficients of the slack of each side over its scale, shape (n, n_sides, 5)."""
-    slack = limits.find_slack_rows(find_value_rows(limits, forces, rates))
-    return np.asarray(slack / limits.side_scales[:, None])
+def find_slack_rows(limits: LimitSet, values: Array) -> Array:
+    """Slack of each side over its scale, (n, n_sides, 5), from values as of `find_value_rows`."""
+    return np.asarray(limits.find_slack_rows(values) / limits.side_scales[:, None])
 
 
 def find_speed_cap(limits: LimitSet, rates: Array) -> Array:
@@ -199,20 +198,20 @@ class InternalForceLimits(NamedTuple):
 
     @staticmethod
     def of(formation: Formation, forces: PathForces, rates: Array) -> InternalForceLimits:
-        """Those of a formation at places with d theta / ds = `rates`, (n, 2)."""
+        """Limits of a formation at places with d theta / ds = `rates`, (n, 2)."""
         limits = make_limits(formation, 0.0)
-        rows = find_slack_rows(limits, forces, rates)
+        rows = find_slack_rows(limits, find_value_rows(limits, forces, rates))
         rows[..., LAMBDA] *= np.abs(rows[..., LAMBDA]) > FLAT
         return InternalForceLimits(limits, PathLimits(rows, np.full(len(rows), np.inf)))
 
     @property
-    def far(self) -> float:
+    def infinity(self) -> float:
         """Internal force that stands for an infinite one [N]."""
         return 1e6 * float(self.limits.scales[self.limits.of(PRESS)[0]])
 
     @property
     def weights(self) -> Array:
-        """By how much each side gives way per newton of epsilon, over its scale, (n_sides,)."""
+        """Change of each side's slack per newton of epsilon, over its scale, (n_sides,)."""
         return np.asarray((self.limits.weigh(EPSILON) / self.limits.scales)[self.limits.sides[0]])
 
     def find_span(self, a: Array, b: Array, epsilon: Array | float) -> tuple[Array, Array]:
@@ -220,9 +219,9 @@ class InternalForceLimits(NamedTuple):
 
         The least is above the largest where there is none.
         """
-        loss = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self.weights)
-        low, high = self.at.relax(-loss).find_internal_force_range(a, b)
-        return np.maximum(low, -self.far), np.minimum(high, self.far)
+        reduction = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self.weights)
+        low, high = self.at.relax(-reduction).find_internal_force_range(a, b)
+        return np.maximum(low, -self.infinity), np.minimum(high, self.infinity)
 
     def find_best(self, a: Array, b: Array) -> BestInternalForce:
         """The internal force with the largest least normal force, at a = s'', b = s'^2.
@@ -234,12 +233,12 @@ class InternalForceLimits(NamedTuple):
         rows[..., ONE], rows[..., A] = self.at.find_slack(a, b, 0 * a), -self.weights
         rows[..., LAMBDA] = self.at.rows[..., LAMBDA]
         limits = self.at._replace(rows=rows)
-        left = limits.eliminate()
-        others = np.where(left.rows[..., A] == 0, left.rows[..., ONE], np.inf)
-        feasible = others.min(axis=1) >= 0
-        least, _, row = left.extreme(0 * b, largest=True)
-        # Where other limits cannot be kept it is these that are to blame.
-        pair = limits.pair(np.where(feasible, row, others.argmin(axis=1)))
+        eliminated = limits.eliminate()
+        other_slack = np.where(eliminated.rows[..., A] == 0, eliminated.rows[..., ONE], np.inf)
+        feasible = other_slack.min(axis=1) >= 0
+        least, _, row = eliminated.extreme(0 * b, largest=True)
+        # Where other limits cannot be kept, the pair of the largest violation.
+        pair = limits.pair(np.where(feasible, row, other_slack.argmin(axis=1)))
         # Zero where it has no influence.
         internal = np.nan_to_num(limits.meet(0 * b, pair)[1])
         owners = np.sort(self.limits.owners[self.limits.sides[0]][pair], axis=1)

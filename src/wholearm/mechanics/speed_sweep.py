@@ -60,8 +60,8 @@ def make_cosine_grid(intervals: int) -> tuple[Array, Array, Array]:
 
 def join_caps(before: Array, after: Array) -> Array:
     """Limits of b at nodes, (..., N + 1), from those in each interval or at its two ends."""
-    none = np.full((*before.shape[:-1], 1), np.inf)
-    pair = np.append(before, none, axis=-1), np.append(none, after, axis=-1)
+    infinite = np.full((*before.shape[:-1], 1), np.inf)
+    pair = np.append(before, infinite, axis=-1), np.append(infinite, after, axis=-1)
     return np.asarray(np.minimum(*pair))
 
 
@@ -118,39 +118,39 @@ def _sweep(
     before, after, one = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (before, after, one))
     # From one node's b, bounds of the other's: slopes and values at zero, interval by interval.
     with np.errstate(divide="ignore", invalid="ignore"):
-        brakes = (after >= 0) & (before < 0)
-        brake_slopes = np.where(brakes, after / -before, 0)
-        brake_values = np.where(brakes, one / -before, np.inf)
+        is_lower = (after >= 0) & (before < 0)
+        brake_slopes = np.where(is_lower, after / -before, 0)
+        brake_values = np.where(is_lower, one / -before, np.inf)
         slopes, values = before / -after, one / -after
-    lows = np.where(after > 0, slopes, 0), np.where(after > 0, values, -np.inf)
+    low_bounds = np.where(after > 0, slopes, 0), np.where(after > 0, values, -np.inf)
     push_slopes, push_values = np.where(after < 0, slopes, 0), np.where(after < 0, values, np.inf)
-    closed = ((before == 0) & (after == 0) & (one < 0)).any(axis=2)
+    infeasible = ((before == 0) & (after == 0) & (one < 0)).any(axis=2)
     caps = np.minimum(cap.T, _UNBOUNDED)
-    top = _find_corners(*lows, push_slopes, push_values, caps[:-1])
-    top[closed] = -1.0
+    top = _find_corners(*low_bounds, push_slopes, push_values, caps[:-1])
+    top[infeasible] = -1.0
     count = len(steps)
     lowest = _pass(brake_slopes[::-1], brake_values[::-1], top[::-1], 0.0)[::-1]
     largest = np.append(np.maximum(lowest, 0.0), np.zeros_like(top[:1]), axis=0)
     b = np.append(
         np.zeros_like(top[:1]), _pass(push_slopes, push_values, largest[1:], -np.inf), axis=0
     )
-    braking, pushed = (
-        (slopes * at[..., None] + values).min(axis=2)
-        for slopes, values, at in (
+    brake_b, push_b = (
+        (slopes * b_node[..., None] + values).min(axis=2)
+        for slopes, values, b_node in (
             (brake_slopes, brake_values, largest[1:]),
             (push_slopes, push_values, b[:-1]),
         )
     )
-    lost = np.concatenate([lowest[:1] < 0, ~(lowest[1:] > 0)])
-    blocked = np.where(lost.any(axis=0), count - 1 - lost[::-1].argmax(axis=0), -1)
+    is_blocked = np.concatenate([lowest[:1] < 0, ~(lowest[1:] > 0)])
+    blocked = np.where(is_blocked.any(axis=0), count - 1 - is_blocked[::-1].argmax(axis=0), -1)
     stalls = np.concatenate([~(b[1:-1] > 0), b[-1:] < -_ROUNDING * b.max(axis=0)])
     blocked = np.where((blocked < 0) & stalls.any(axis=0), stalls.argmax(axis=0), blocked)
     farthest = (push_slopes * lowest[..., None] + push_values).min(axis=2)
-    braked = (braking < caps[:-1]) & (farthest >= largest[1:])
-    slower = np.concatenate([np.zeros((1, len(rows)), bool), pushed < largest[1:]])
-    modes = np.where(braked, SweepMode.BRAKE, SweepMode.HELD)
-    modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
-    modes = np.where(slower[1:], SweepMode.PUSH, modes)
+    is_braked = (brake_b < caps[:-1]) & (farthest >= largest[1:])
+    is_pushed = np.concatenate([np.zeros((1, len(rows)), bool), push_b < largest[1:]])
+    modes = np.where(is_braked, SweepMode.BRAKE, SweepMode.HELD)
+    modes = np.where(is_pushed[:-1], SweepMode.SWITCH, modes)
+    modes = np.where(is_pushed[1:], SweepMode.PUSH, modes)
     return SpeedProfile(np.maximum(b, 0.0).T, modes.T, blocked)
 
 
@@ -179,8 +179,8 @@ def _split(
     one, of_b = rows[..., ONE], rows[..., B]
     if b_guess is not None:
         speed = np.sqrt(np.maximum(b_guess, 0.0))[..., None]
-        drag = np.divide(rows[..., V], 2 * speed, out=np.zeros_like(one), where=speed > 0)
-        of_b, one = of_b + drag, one + rows[..., V] * speed / 2
+        viscous = np.divide(rows[..., V], 2 * speed, out=np.zeros_like(one), where=speed > 0)
+        of_b, one = of_b + viscous, one + rows[..., V] * speed / 2
     of_a = rows[..., A] / (2 * steps)[:, None]
     return (1 - part)[:, None] * of_b - of_a, part[:, None] * of_b + of_a, one
 
@@ -201,15 +201,15 @@ def _find_corners(
     for _ in range(low_slopes.shape[-1] ** 2):
         low, high = low_slopes * b[:, None] + low_values, high_slopes * b[:, None] + high_values
         i, j = (n, low.argmax(axis=1)), (n, high.argmin(axis=1))
-        rests = low[i] <= 0
+        at_rest = low[i] <= 0
         with np.errstate(invalid="ignore", divide="ignore"):
-            slope = high_slopes[j] - np.where(rests, 0, low_slopes[i])
-            value = high_values[j] - np.where(rests, 0, low_values[i])
+            slope = high_slopes[j] - np.where(at_rest, 0, low_slopes[i])
+            value = high_values[j] - np.where(at_rest, 0, low_values[i])
             corner = np.where(slope < 0, value / -slope, -1.0)
-        short = (slope * b + value < 0) & (corner < b * (1 - 1e-14)) & (b > 0)
-        if not short.any():
+        is_infeasible = (slope * b + value < 0) & (corner < b * (1 - 1e-14)) & (b > 0)
+        if not is_infeasible.any():
             break
-        b[short] = np.maximum(corner[short], -1.0)
+        b[is_infeasible] = np.maximum(corner[is_infeasible], -1.0)
     return b.reshape(shape)
 
 
@@ -218,15 +218,15 @@ class ControllableSet(NamedTuple):
 
     low: Array  # low, high (n,) [m^2/s^2]: range of b
     high: Array
-    share: Array  # (n - 1,): share of the margins that each interval keeps
+    fraction: Array  # (n - 1,): share of the margins that each interval keeps
     rows: list[Array]  # (m, 3): limits before b + after b' + one >= 0 of each interval
 
     def run(self, first: float) -> Array:
         """Forward pass: b at the nodes of the fastest motion from b = `first`, shape (n,)."""
         b = np.full(len(self.low), first)
         for k, (before, after, one) in enumerate(rows.T for rows in self.rows):
-            falls = after < 0
-            fastest = float(((before[falls] * b[k] + one[falls]) / -after[falls]).min())
+            is_upper = after < 0
+            fastest = float(((before[is_upper] * b[k] + one[is_upper]) / -after[is_upper]).min())
             b[k + 1] = min(max(fastest, self.low[k + 1]), self.high[k + 1])
         return b
 
@@ -237,7 +237,7 @@ def find_controllable(
     steps: Array,
     floor: Array,
     end: tuple[float, float],
-    shares: Sequence[float],
+    fractions: Sequence[float],
 ) -> ControllableSet:
     """Backward pass in which each interval keeps the largest feasible share of margins.
 
@@ -253,36 +253,36 @@ def find_controllable(
     shares          that are tried, the largest first; with the last one only `limits.cap` is
                     feasible if nothing is
     """
-    rows, tight = (each.eliminate().rows.copy() for each in (limits, limits.relax(-margins)))
+    rows, tight = (x.eliminate().rows.copy() for x in (limits, limits.relax(-margins)))
     losses = rows[..., ONE] - tight[..., ONE]
     rows[..., ONE] += rows[..., V] * np.sqrt(limits.cap)[:, None]
     first = _split(rows[:-1], steps, np.zeros(len(steps)))
     last = _split(rows[1:], steps, np.ones(len(steps)))
     table = np.stack([np.hstack(pair) for pair in zip(first, last, strict=True)], axis=-1)
     losses = np.hstack([losses[:-1], losses[1:]])
-    low, high, share = floor.copy(), limits.cap.copy(), np.full(len(steps), shares[-1])
+    low, high, fraction = floor.copy(), limits.cap.copy(), np.full(len(steps), fractions[-1])
     low[-1], high[-1] = end
     intervals = list[Array]()
     for k in range(len(steps) - 1, -1, -1):
         box = np.array([[0.0, -1.0, high[k + 1]], [0.0, 1.0, -low[k + 1]]])
         bounding = (table[k, :, :2] != 0).any(axis=1) | (losses[k] != 0)
-        here, loss = table[k, bounding], losses[k, bounding]
-        chosen, least, most = box, floor[k], limits.cap[k]
-        begin, stop = 0, len(shares)
+        rows_k, loss = table[k, bounding], losses[k, bounding]
+        feasible, least, most = box, floor[k], limits.cap[k]
+        begin, stop = 0, len(fractions)
         while begin < stop:
             middle = begin if begin == 0 else (begin + stop) // 2
-            tried = np.vstack([here, box])
-            tried[:-2, 2] -= shares[middle] * loss
-            slowest, fastest = _find_range(tried)
+            candidate = np.vstack([rows_k, box])
+            candidate[:-2, 2] -= fractions[middle] * loss
+            slowest, fastest = _find_range(candidate)
             slowest, fastest = max(slowest, floor[k]), min(fastest, limits.cap[k])
             if slowest <= fastest + 1e-9 * limits.cap[k]:
-                chosen, least, most, stop = tried, slowest, fastest, middle
-                share[k] = shares[middle]
+                feasible, least, most, stop = candidate, slowest, fastest, middle
+                fraction[k] = fractions[middle]
             else:
                 begin = middle + 1
-        intervals.append(chosen)
+        intervals.append(feasible)
         low[k], high[k] = least, most
-    return ControllableSet(low, high, share, intervals[::-1])
+    return ControllableSet(low, high, fraction, intervals[::-1])
 
 
 def _find_range(rows: Array) -> tuple[float, float]:

@@ -33,7 +33,7 @@ from ..results.dwell_record import TorqueChange, change_torques
 from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from .lower_bound import look_along
+from .lower_bound import sweep_time
 from .nlp import charge
 from .options import Objective, PlanOptions
 from .path_domain.path_plan import Task, plan_curves
@@ -480,7 +480,7 @@ class ImpactSequence:
         """Estimated least time [s], with stops where impacts are not possible."""
         try:
             curves = (part.continuous_curves for part in self.split())
-            return sum(look_along(each, epsilon, intervals=24) for each in curves)
+            return sum(sweep_time(each, epsilon, intervals=24) for each in curves)
         except NoMotionError:
             number = self.phases[0].number
             raise SolverError(f"phase {number}: no motion keeps the limits") from None

@@ -101,9 +101,8 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, node: int) -> tuple[
     low, high = require_hold(data, phase, node)
     high = min(high, low + 40.0 * curve.formation.scene.scales.force)  # the widest range
     lam = low + np.linspace(0.01, 0.99, 129) * (high - low)  # candidates
-    forces = data.nodes.forces
-    T0, by_lambda = forces.of_tau[node, :, ONE], forces.of_tau[node, :, LAMBDA]
-    return T0 + np.outer(lam, by_lambda), lam
+    of_tau = data.of_tau[node]
+    return of_tau[:, ONE] + np.outer(lam, of_tau[:, LAMBDA]), lam
 
 
 def require_hold(data: PhaseData, phase: int, node: int) -> tuple[float, float]:

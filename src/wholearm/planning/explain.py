@@ -266,7 +266,7 @@ def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
     task = _change_task(task, parameter, value)
     if task.find_fastest() is None:
         raise SolverError("no motion keeps the limits")
-    task = replace(task, options=task.options.roughen(), guides=())
+    task = replace(task, options=task.options.roughen(), references=())
     return plan_curves(task, explained=False)
 
 
@@ -305,7 +305,7 @@ def _explain_rate_limits(task: Task, reason: str) -> WholearmError:
 
     def plan(scene: Scene, pins: Pins = (None, None), explained: bool = True) -> Scene:
         curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]
-        plan_curves(replace(task, curves=curves, guides=(), pins=pins), explained)
+        plan_curves(replace(task, curves=curves, references=(), pins=pins), explained)
         return scene
 
     try:

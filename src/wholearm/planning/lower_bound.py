@@ -31,10 +31,10 @@ from ..mechanics.speed_sweep import (
     speed_sweep,
 )
 
-GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
+RELAXATION = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
 # Intervals on each side of a blocked one that are split, into how many, and how often; case: the
 # border of an octagon's flip, passed at a tenth of the speed beside it.
-_NARROW, _PARTS, _TRIES = 2, 4, 4
+_NEIGHBOURS, _PARTS, _ATTEMPTS = 2, 4, 4
 # Shortfall of limits, over their scales, at the largest speed, beyond which that is too low; case:
 # query 8, where a contact turns back at a speed of 75 % of the least one.
 _SHORT = 5e-3
@@ -95,31 +95,31 @@ class PathTerms:
         return PathGrid(ends, np.arange(len(counts))).split(counts)
 
     def evaluate(self, angles: Array, owners: Numbers) -> PathLimits:
-        """Limits without lambda at angles (N, n), each row of them as part of a segment."""
+        """Limits without lambda at angles (N, n), each row on the segment of its owner."""
         s, parts = self.place(angles), []
         owner, number, start, stop = np.array(self.pieces)[owners].T[..., None]
         for index, (curve, offset) in enumerate(zip(self.curves, self.offsets, strict=False)):
-            mine = owner[:, 0] == index
-            local = np.clip(s[mine], start[mine], stop[mine]) - offset
+            selected = owner[:, 0] == index
+            local = np.clip(s[selected], start[selected], stop[selected]) - offset
             point = curve.evaluate(np.clip(local.ravel(), 0.0, curve.length))
-            segment = np.repeat(number[mine].astype(np.int64), angles.shape[1])
+            segment = np.repeat(number[selected].astype(np.int64), angles.shape[1])
             parts.append(find_limits(curve, self.epsilon, point, segment))
         rows, cap = (np.concatenate(column) for column in zip(*parts, strict=True))
         return PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
 
 
 def find_limits(curve: Curve, epsilon: float, point: CurvePoint, segment: Numbers) -> PathLimits:
-    """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
+    """Limits without lambda at n places of a curve, each as part of a segment; see `RELAXATION`."""
     forces = inverse(curve.formation, point, directions_of(curve, segment))
     limits = make_limits(curve.formation, epsilon)
-    return PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()
+    return PathLimits.of(limits, forces, point.z_s[:, 3:], RELAXATION).eliminate()
 
 
 class LowerBound(NamedTuple):
-    """A lower bound of the least time."""
+    """Lower bound of the least time."""
 
     value: float  # [s]: the bound, less the estimate of its error
-    error: float  # [s]: that estimate, by quadratures of two orders
+    error: float  # [s]: the estimate, by quadratures of two orders
 
 
 def bound_least_time(
@@ -132,38 +132,38 @@ def bound_least_time(
     low.
     """
     path = PathTerms(curves, epsilon)
-    grid, b_guess, bound, tries = path.make_grid(intervals), None, None, 0
-    for left in reversed(range(grids)):
+    grid, b_guess, bound, attempts = path.make_grid(intervals), None, None, 0
+    for remaining in reversed(range(grids)):
         try:
             bound, losses, motion, time = _bound(path, grid, b_guess)
         except NoMotionError as error:
-            tries += 1
-            if tries > _TRIES or not left:
+            attempts += 1
+            if attempts > _ATTEMPTS or not remaining:
                 break
             parts = np.ones(len(grid.owners), dtype=np.int64)
-            parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
+            parts[max(error.interval - _NEIGHBOURS, 0) : error.interval + _NEIGHBOURS + 1] = _PARTS
             grid, b_guess = grid.split(parts), None
             continue
-        if not left:
+        if not remaining:
             break
-        share = losses / (3e-8 * time)  # relative tolerance
+        excess = losses / (3e-8 * time)  # relative tolerance
         # Losses at switches and kinks fall with the square or the third power of the interval.
-        parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)
+        parts = np.clip(np.ceil(np.cbrt(excess * len(excess))), 1, 8).astype(np.int64)
         # If not all can be split, those that lose most are.
-        order = np.argsort(-share)
+        order = np.argsort(-excess)
         parts[order[np.cumsum(parts[order] - 1) > 1500 - len(parts)]] = 1  # most intervals
         # Where p falls although b has no bound nothing is bounded, on any grid.
-        parts[np.isinf(share) & (np.diff(grid.angles) < 1e-6)] = 1
-        if share.sum() < 1 or (parts == 1).all():
+        parts[np.isinf(excess) & (np.diff(grid.angles) < 1e-6)] = 1
+        if excess.sum() < 1 or (parts == 1).all():
             break
-        finer = grid.split(parts)
-        middles = (finer.angles[1:] + finer.angles[:-1]) / 2
+        refined = grid.split(parts)
+        middles = (refined.angles[1:] + refined.angles[:-1]) / 2
         b_guess = np.interp(path.place(middles), path.place(grid.angles), motion.b)
-        grid = finer
+        grid = refined
     return bound
 
 
-def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
+def sweep_time(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
     """Estimated least time along curves from rest to rest [s]; see `bound_least_time`.
 
     Limits are kept at one place of each interval of a coarse grid. NoMotionError without a motion,
@@ -173,13 +173,13 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     grid = path.make_grid(intervals)
     *_, motion, duration = _bound(path, grid, None)
     # Where segments meet, on both sides.
-    lasts = np.flatnonzero(np.diff(grid.owners))
-    turns, both = np.repeat(lasts + 1, 2), np.stack([lasts, lasts + 1], axis=1).ravel()
-    at_turns = path.evaluate(grid.angles[turns, None], grid.owners[both]).pick((slice(None), 0))
-    slack = at_turns.at(motion.b[turns] * np.linspace(0.0, 1.0, 5)[:, None])
-    least, most = find_range(at_turns.rows[..., A], slack + _SHORT)
-    if (slow := (least > most).all(axis=0)).any():
-        raise NoMotionError(int(turns[slow.argmax()]))
+    last = np.flatnonzero(np.diff(grid.owners))
+    ends, sides = np.repeat(last + 1, 2), np.stack([last, last + 1], axis=1).ravel()
+    limits = path.evaluate(grid.angles[ends, None], grid.owners[sides]).pick((slice(None), 0))
+    slack = limits.at(motion.b[ends] * np.linspace(0.0, 1.0, 5)[:, None])
+    least, most = find_range(limits.rows[..., A], slack + _SHORT)
+    if (blocked := (least > most).all(axis=0)).any():
+        raise NoMotionError(int(ends[blocked.argmax()]))
     return duration
 
 
@@ -220,11 +220,11 @@ def _bound(
     # Where p falls from one interval to the next.
     jumps = np.minimum((y[:-1, 1] - y[1:, 0]) / np.sin(grid.angles[1:-1]), 0.0)
     taken = np.zeros(len(jumps))
-    at = np.flatnonzero(jumps)
-    taken[at] = np.minimum(right.pick(at).find_largest_b(), left.pick(at + 1).find_largest_b())
-    lost = np.abs(jumps * (taken - motion.b[1:-1]))
-    losses[:-1] += lost
-    losses[1:] += lost
+    k = np.flatnonzero(jumps)
+    taken[k] = np.minimum(right.pick(k).find_largest_b(), left.pick(k + 1).find_largest_b())
+    jump_losses = np.abs(jumps * (taken - motion.b[1:-1]))
+    losses[:-1] += jump_losses
+    losses[1:] += jump_losses
     total = float(fine.sum() + jumps @ taken)
     estimate = 2.0 * float(error.sum())  # both quadratures err alike at switches
     value = max(0.0, total - estimate) if np.isfinite(total) else 0.0
@@ -266,7 +266,7 @@ def find_costate(
     # From switches and speed limits, back where accelerating, forth where braking.
     steps, last = np.diff(grid.angles), len(modes) - 1
     ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
-    at_rest = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * path.length / 2)) for a in ends]
+    rest_values = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * path.length / 2)) for a in ends]
     for mode, order, near, far in (
         (SweepMode.PUSH, range(last, -1, -1), 1, 0),
         (SweepMode.BRAKE, range(last + 1), 0, 1),
@@ -276,10 +276,10 @@ def find_costate(
             if modes[n] != mode:
                 continue
             previous = n - step
-            goes_on = 0 <= previous <= last and modes[previous] in (mode, SweepMode.SWITCH)
-            y[n, near] = y[previous, far] if goes_on else 0.0
+            is_continued = 0 <= previous <= last and modes[previous] in (mode, SweepMode.SWITCH)
+            y[n, near] = y[previous, far] if is_continued else 0.0
             if n == (last if far else 0):
-                y[n, far] = at_rest[far]
+                y[n, far] = rest_values[far]
             else:
                 # Trapezoidal rule.
                 half, of_y = step * steps[n] / 2, rates[n]
@@ -312,35 +312,35 @@ def interpolate_costate(
 def find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
     """H at n places, from p and p' there."""
     least = _find_least(limits, p, slope)
-    lost = np.flatnonzero(~np.isfinite(least))
-    if len(lost):
-        bounded = limits.pick(lost)
+    unbounded = np.flatnonzero(~np.isfinite(least))
+    if len(unbounded):
+        bounded = limits.pick(unbounded)
         bounded = bounded._replace(cap=bounded.find_largest_b())
-        least[lost] = _find_least(bounded, p[lost], slope[lost])
+        least[unbounded] = _find_least(bounded, p[unbounded], slope[unbounded])
     return least
 
 
 def _find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
-    share, cap, rows = _weigh(limits, p), limits.cap[:, None], limits.rows
+    weight, cap, rows = _weigh(limits, p), limits.cap[:, None], limits.rows
     with np.errstate(over="ignore", invalid="ignore"):
-        c, g = share * rows[..., B] - slope[:, None], share * rows[..., V]
-        least = _minimise(c, g, cap) + share * rows[..., ONE]
-    least = np.where((share < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
+        c, g = weight * rows[..., B] - slope[:, None], weight * rows[..., V]
+        least = _minimise(c, g, cap) + weight * rows[..., ONE]
+    least = np.where((weight < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
     return np.where(p == 0, _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0], least)
 
 
 def evaluate(rows: PathLimits, p: Array, slope: Array, b: Array) -> Array:
     """The integrand at n places for some b and the best a."""
-    share, rest = _weigh(rows, p), rows.at(b)
-    push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
-    return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
+    weight, slack = _weigh(rows, p), rows.at(b)
+    largest = np.where(weight < 0, weight * slack, -np.inf).max(axis=1)
+    return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, largest))
 
 
 def _weigh(limits: PathLimits, p: Array) -> Array:
-    """Weight of a row's rest in the integrand if it alone bounds p a; 0 if it cannot."""
+    """Weight of a row's slack in the integrand if the row alone bounds p a; 0 if it cannot."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        share = 2 * p[:, None] / limits.rows[..., A]
-        return np.where((share < 0) & np.isfinite(share), share, 0.0)
+        weight = 2 * p[:, None] / limits.rows[..., A]
+        return np.where((weight < 0) & np.isfinite(weight), weight, 0.0)
 
 
 def _minimise(c: Array, g: Array, cap: Array) -> Array:
@@ -359,7 +359,7 @@ def _minimise(c: Array, g: Array, cap: Array) -> Array:
             root = np.where(g == 0, root, x)
         v = np.sqrt(cap)
         inner = np.where(root > 0, np.minimum(1 / root, v), v)
-        first = np.where(c == 0, g, c)
-        limit = np.where(first == 0, 0.0, np.copysign(np.inf, first))
+        leading = np.where(c == 0, g, c)
+        limit = np.where(leading == 0, 0.0, np.copysign(np.inf, leading))
         values = [np.where(np.isfinite(x), 1 / x + g * x + c * x**2, limit) for x in (inner, v)]
         return np.where(c > 0, values[0], np.minimum(*values))

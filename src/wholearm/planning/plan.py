@@ -324,7 +324,7 @@ def _find_widest(
 
     low, high, middle = 0.0, np.inf, min(1.0, limit)
     while low < limit and (np.isinf(high) or high - low > 0.01 * high):  # relatively
-        task = replace(first, options=scale(middle), guides=tuple(references))
+        task = replace(first, options=scale(middle), references=tuple(references))
         fastest = task.find_fastest()
         if fastest is None:
             high = middle

@@ -29,22 +29,22 @@ class Iterate(Protocol):
         """Estimated relative error of the objective."""
 
     def solve(self) -> Self:
-        """The solution on this mesh; SolverError without one."""
+        """Solve on this mesh; SolverError without a solution."""
 
     def adapt(self) -> Self | None:
-        """The next one to solve, on another mesh or with tighter limits; None if nothing is due."""
+        """The next iterate, on another mesh or with tighter limits; None if none is needed."""
 
     def restart(self) -> Self | None:
-        """The next one to solve where this has no solution; None without one."""
+        """The next iterate after one without a solution; None if there is none."""
 
 
 I = TypeVar("I", bound=Iterate)  # noqa: E741
 
 
 def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
-    """The solution without violations whose estimated error is below the accuracy, or least.
+    """The first solution without violations and with an error below `accuracy`, or the best one.
 
-    The SolverError if none keeps the limits between nodes is that of the first mesh.
+    SolverError, of the first failed mesh, if no solution keeps the limits between nodes.
     """
     iterate: I | None = first
     best: I | None = None

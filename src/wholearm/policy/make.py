@@ -33,6 +33,7 @@ from ..mechanics.dynamics import (
     Directions,
     PathForces,
     V,
+    apply,
     inverse,
     metric_weights,
     stack_motion,
@@ -177,7 +178,7 @@ def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
         changes = np.array([*ERRORS.values()])[:, None] * state.find_slopes(tuple(ERRORS))
         delay_change = find_response(forces, lagged)[0] - c
         changes = np.append(changes, delay_change[:, :, None], axis=2)
-        errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
+        errors = apply(changes, *motion)
         error = np.linalg.norm(force_gradients(contact) @ errors, axis=2)
         levels.append(slack / (SETTINGS.force_margin * contact.side_scales + error)[..., None])
     before, after = map(np.hstack, sides)
@@ -433,7 +434,7 @@ def _trace(
         required = np.full(rows.slack.shape[1], size)
         required[rows.n_force :] = SETTINGS.reference_torque
         controllable_set = retime(s, rows.slack, required, motion[1], end)
-        fraction = float(controllable_set.share.min())
+        fraction = float(controllable_set.fraction.min())
         if best is not None and fraction <= best[2]:
             break
         best = rows, controllable_set, fraction
@@ -472,9 +473,9 @@ def retime(
     for limit in (1.0, *caps):
         fractions = [limit, *(fraction for fraction in SETTINGS.fractions if fraction < limit)]
         controllable_set = find_controllable(limits, required, np.diff(s), floor, end, fractions)
-        if best is None or controllable_set.share.min() > best.share.min():
+        if best is None or controllable_set.fraction.min() > best.fraction.min():
             best = controllable_set
-        if best.share.min() >= 0.8 * limit:
+        if best.fraction.min() >= 0.8 * limit:
             break
     assert best is not None
     return best
@@ -509,7 +510,7 @@ def retime_in_ranges(
             rows, slack, required = limits.at(motion)
             controllable_set = retime(s, slack, required, plan[1], end, ())
             b = controllable_set.run(float(controllable_set.high[0]))
-            if controllable_set.share.min() < 0.5:
+            if controllable_set.fraction.min() < 0.5:
                 return None
             a = np.gradient(b, s) / 2
             motion = a, b, find_internal_force(rows.slack, a, b)[1]

@@ -25,13 +25,13 @@ from ..mechanics.dynamics import (
     LAMBDA,
     Directions,
     PathForces,
+    apply,
     forward,
     inverse,
     metric_weights,
-    stack_motion,
 )
 from ..mechanics.limits import SPEED, TORQUE, make_limits
-from ..mechanics.path_limits import find_slack_rows
+from ..mechanics.path_limits import find_slack_rows, find_value_rows
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
@@ -104,7 +104,7 @@ def find_internal_force(slack: Array, a: Array, b: Array) -> tuple[Array, Array]
 
     `slack`, (n, m, 5), is linear in (1, a, b, s', internal force).
     """
-    base = np.einsum("nmi,ni->nm", slack, stack_motion(a, b, np.zeros_like(b)))
+    base = apply(slack, a, b, np.zeros_like(b))
     lines = np.stack([base, slack[..., LAMBDA]], axis=2).tolist()
     least, internal = np.array([choose_internal_force(line) for line in lines]).T
     return least, internal
@@ -173,7 +173,8 @@ def split_modes(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedS
         weights = np.concatenate([limit.weight for limit in limits.limits])[limits.sides[0]]
         torque = np.isin(limits.sides[0], limits.of(TORQUE))
         margins = np.where(torque, TORQUE_MARGIN, FORCE_MARGIN * weights)
-        slack = find_slack_rows(limits, forces, v[:, 3:]) / margins[:, None]
+        values = find_value_rows(limits, forces, v[:, 3:])
+        slack = find_slack_rows(limits, values) / margins[:, None]
         yield RegulatedStretch(formation, z, v, directions, forces, slack)
 
 

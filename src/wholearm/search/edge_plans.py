@@ -19,7 +19,7 @@ from ..common.arrays import Array, round_to
 from ..common.errors import InputError, SolverError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
-from ..geometry.path_guess import STILL, count_freedoms, find_end
+from ..geometry.path_guess import MIN_DISTANCE, count_freedoms, find_end
 from ..geometry.tracing import CostToGo, find_headings, split_blocks, trace_phase
 from ..mechanics.dynamics import measure_speed
 from ..planning.blocks import (
@@ -115,7 +115,7 @@ def plan_coarsely(
         one_phase = len(phases) == 1
         closed = close_place(edge.stop) if one_phase else None
         goal = closed.z if closed else find_end(phases[0], z, phases[1:])
-        if measure_speed(problem.scene, goal - z) < STILL * problem.scene.scales.length:
+        if measure_speed(problem.scene, goal - z) < MIN_DISTANCE * problem.scene.scales.length:
             return None  # `until` holds already at the start.
         target = goal if straight and one_phase else None
         guesses = list[PhasePlan[TimeMotion]]()

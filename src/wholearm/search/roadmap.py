@@ -26,7 +26,7 @@ from ..mechanics.dynamics import ONE, Directions, close_contacts, force_rows, in
 from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
-from ..planning.lower_bound import GIVE
+from ..planning.lower_bound import RELAXATION
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Problem, Until
 from ..scene.model import Scene
@@ -82,7 +82,7 @@ def evaluate_paths(
         regular = np.asarray(np.abs(np.linalg.det(wrenches)) > 1e-9 * sizes)
     kinematics = kinematics._replace(A=np.where(regular[:, None, None], kinematics.A, np.nan))
     forces = inverse(formation, point._replace(kinematics=kinematics), directions)
-    rows, cap = PathLimits.of(limits, forces, rates[:, 3:], GIVE)
+    rows, cap = PathLimits.of(limits, forces, rates[:, 3:], RELAXATION)
     # No motion if three contacts cannot balance the object, or a finger cannot reach it.
     regular &= np.isfinite(rows).all(axis=(1, 2))
     rows = np.where(regular[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])

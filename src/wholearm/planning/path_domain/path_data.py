@@ -1,7 +1,7 @@
 """Inverse dynamics and limits along the curves of phases, at nodes and between them.
 
-Coefficients of forces are evaluated at the nodes and at a few knots of every interval. Polynomials
-through the knots give them where limits are checked.
+Coefficients of the limited values are evaluated at the nodes and at a few knots of every interval.
+Polynomials through the knots give them where limits are checked.
 """
 
 from __future__ import annotations
@@ -15,36 +15,30 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, find_minima
 from ...common.errors import InputError, JammingError, SolverError
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
+from ...mechanics.dynamics import apply, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ...results.torque import TorqueProfile
-from ..robust.robust_rows import RobustLimits, repeat_limits
+from ..robust.robust_rows import COPIES, RobustLimits, evaluate_robust, repeat_limits, widen
 from .path_motion import Elements, Grid, PathMotion, Profile
 
-PLACES = 13  # interpolation points where torques of a motion are not those through the knots
-LOOKS = 21  # samples of torque rates in each interval
+KNOTS = 13  # interpolation points where torques of a motion are not those through the knots
+RATE_SAMPLES = 21  # samples of torque rates in each interval
 
 
 class Sampling(NamedTuple):
-    """Knots of forces and places of checks in an interval, from 0 to 1, its ends included."""
+    """Knots of coefficients and places of checks in an interval, from 0 to 1, with both ends."""
 
     knots: Array
     checks: Array
 
 
 class Places(NamedTuple):
-    """Inverse dynamics at n places of a curve."""
+    """Coefficients of the limited values at n places of a curve."""
 
-    of_c: Array  # of_c, of_tau: coefficients of forces, as in `PathForces`
-    of_tau: Array
+    values: Array  # (n, m, 5): coefficients of the limited values, of (1, s'', s'^2, s', lambda)
     rates: Array  # (n, 2): d theta / ds
-    variations: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
-
-    @property
-    def forces(self) -> PathForces:
-        """Contact forces and torques."""
-        return PathForces(self.of_c, self.of_tau)
+    variations: Array  # (n, k, 1 + p, 5): as of `robust_rows`, or none of shape (n, 0)
 
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
@@ -61,34 +55,30 @@ class PhaseData(NamedTuple):
     grid: Grid
     nodes: Places  # at the nodes
     sampling: Sampling
-    knots: Places  # at the knots of every solid interval, interval by interval
     checks: Places  # at the checks of every solid interval, interval by interval
-    spread: RobustLimits | None = None  # robust force limits, if there are ranges
+    robust: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
     def torque_limit(self) -> Array:
         """Torque limits, shape (2,) [N m]."""
         return self.limits.high[self.limits.of(TORQUE)]
 
-    def find_terms(self) -> Array:
-        """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
-        return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
+    @property
+    def of_tau(self) -> Array:
+        """Coefficients of the torques at the nodes, shape (N + 1, 2, 5) [N m]."""
+        return self.nodes.values[:, self.limits.of(TORQUE)]
 
     def find_limits(self, places: Places) -> PathLimits:
         """The limits at places, with the internal force."""
-        rows = find_slack_rows(self.limits, places.forces, places.rates)
-        return PathLimits(rows, self.largest_b(places))
+        return PathLimits(find_slack_rows(self.limits, places.values), self.largest_b(places))
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
-        rates = places.rates * np.sqrt(profile.b)[:, None]
-        forces = places.forces.c(*profile), places.forces.tau(*profile)
-        values = np.hstack([*forces, rates]) @ self.limits.rows.T
-        if self.spread is not None:
-            least = self.spread.evaluate(places.forces, places.variations, profile)
-            rows = self.limits.of(PRESS, CONE)
-            values[:, rows] = np.repeat(least, len(rows) // least.shape[1], axis=1)
-        return np.asarray(values)
+        values = apply(places.values, *profile)
+        if self.robust is not None:
+            rows, worst = self.limits.of(PRESS, CONE), evaluate_robust(places.variations, profile)
+            values[:, rows] = np.repeat(worst, COPIES, axis=1)
+        return values
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
         """Slack of each side, less a `margin` of normal forces, shape (n, n_sides) [N, N m]."""
@@ -104,27 +94,27 @@ class PhaseData(NamedTuple):
         """The profile at `fractions` of every solid interval, interval by interval."""
         return Elements(self.grid, profile).at(fractions)
 
-    def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
+    def find_violations(self, profile: Profile, margin: float) -> tuple[Array, Array]:
         """Violations in each solid interval, (n_solid, n_sides) [N, N m]; of b, relatively."""
-        here = self.interpolate(profile, self.sampling.checks)
-        speed_slack = 1 - here.b / self.largest_b(self.checks)
-        slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
+        samples = self.interpolate(profile, self.sampling.checks)
+        speed_slack = 1 - samples.b / self.largest_b(self.checks)
+        slack = np.column_stack([self.slack(self.checks, samples, margin), speed_slack])
         least = find_minima(slack.reshape(-1, len(self.sampling.checks), slack.shape[1]))
-        short = np.maximum(-least, 0.0)
-        return short[:, :-1], short[:, -1]
+        violations = np.maximum(-least, 0.0)
+        return violations[:, :-1], violations[:, -1]
 
-    def spread_to_nodes(self, inside: Array) -> Array:
+    def move_to_nodes(self, values: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
-        table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty
-        table[k] = inside
-        table[k + 1] = np.maximum(table[k + 1], inside)
-        return table
+        at_nodes, k = np.zeros((len(self.grid.s), *values.shape[1:])), self.grid.nonempty
+        at_nodes[k] = values
+        at_nodes[k + 1] = np.maximum(at_nodes[k + 1], values)
+        return at_nodes
 
 
 def prepare(
-    curve: Curve, epsilon: float, grid: Grid, phase: int, spread: RobustLimits | None = None
+    curve: Curve, epsilon: float, grid: Grid, phase: int, robust: RobustLimits | None = None
 ) -> PhaseData:
-    """Evaluate inverse dynamics and limits, with a `spread` robust ones, along a curve.
+    """Evaluate inverse dynamics and limits, with `robust` also robust ones, along a curve.
 
     Raises
     ------
@@ -133,10 +123,10 @@ def prepare(
     """
     nonempty = grid.nonempty
     sampling = choose_sampling(len(grid.s))
-    inner = sampling.knots[1:-1]
-    between = (grid.s[nonempty, None] + inner * grid.steps[nonempty, None]).ravel()
-    s = np.concatenate([grid.s, between])
-    segment = np.concatenate([grid.segment, np.repeat(grid.segment[nonempty], len(inner))])
+    inner_knots = sampling.knots[1:-1]
+    s_knots = (grid.s[nonempty, None] + inner_knots * grid.steps[nonempty, None]).ravel()
+    s = np.concatenate([grid.s, s_knots])
+    segment = np.concatenate([grid.segment, np.repeat(grid.segment[nonempty], len(inner_knots))])
     point = curve.evaluate(s)
     formation, directions = curve.formation, directions_of(curve, segment)
     inertia = reduced_inertia(formation, point.kinematics, directions)
@@ -150,37 +140,39 @@ def prepare(
             f"phase {phase}: {' '.join(formation.names)} jams at {describe_pose(point.z[worst])}: "
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
-    forces = inverse(formation, point, directions)
+    forces, rates = inverse(formation, point, directions), point.z_s[:, 3:]
+    limits, speeds = make_limits(formation, epsilon).split(2)
     variations = np.zeros((len(s), 0))
-    if spread is not None:
-        variations = spread.find_variations(formation, point, directions, forces, epsilon)
-    every = Places(*forces, point.z_s[:, 3:], variations)
-    added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
-    knots = every.pick(np.hstack([nonempty[:, None], added, nonempty[:, None] + 1]).ravel())
+    if robust is not None:
+        variations = robust.find_variations(formation, point, directions, forces, epsilon)
+    all_places = Places(find_value_rows(limits, forces, rates), rates, variations)
+    knot_rows = len(grid.s) + np.arange(len(s_knots)).reshape(len(nonempty), -1)
+    rows = np.hstack([nonempty[:, None], knot_rows, nonempty[:, None] + 1]).ravel()
 
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
     to_checks, to_knots = (
         (2 * places[:, None] - 1) ** np.arange(len(sampling.knots))
         for places in (sampling.checks, sampling.knots)
     )
-    through = to_checks @ np.linalg.inv(to_knots)
+    matrix = to_checks @ np.linalg.inv(to_knots)
 
     def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
-        return (through @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
+        return (matrix @ table).reshape(len(nonempty) * len(sampling.checks), *values.shape[1:])
 
-    nodes, checks = every.pick(slice(None, len(grid.s))), Places(*map(interpolate, knots))
-    limits = make_limits(formation, epsilon)
-    if spread is not None:
-        limits = repeat_limits(limits)
-        inside = (grid.s[nonempty, None] + sampling.checks * grid.steps[nonempty, None]).ravel()
+    nodes = all_places.pick(slice(None, len(grid.s)))
+    checks = Places(*map(interpolate, all_places.pick(rows)))
+    if robust is not None:
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
+        positions = (grid.s, grid.segment), (interpolate(s[rows]), owners)
         nodes, checks = (
-            each._replace(of_c=spread.extend(each.of_c, each.variations, spread.pick_signs(*at)))
-            for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
+            places._replace(
+                values=widen(limits, places.values, places.variations, robust.pick_signs(*where))
+            )
+            for places, where in zip((nodes, checks), positions, strict=True)
         )
-    kept = limits.split(2)
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, spread)
+        limits = repeat_limits(limits)
+    return PhaseData(curve, epsilon, limits, speeds, grid, nodes, sampling, checks, robust)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -199,7 +191,6 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     return parts[0]._replace(
         grid=Grid(*stack(grids)),
         nodes=Places(*stack(part.nodes for part in parts)),
-        knots=Places(*stack(part.knots for part in parts)),
         checks=Places(*stack(part.checks for part in parts)),
     )
 
@@ -217,22 +208,15 @@ def choose_sampling(nodes: int) -> Sampling:
 def fit_torque(data: PhaseData, motion: PathMotion) -> TorqueProfile:
     """Torque of a motion, one polynomial in time per interval.
 
-    Through the knots, or through Chebyshev points in time if that misses the torque between them.
-    SolverError if the motion all but stops in an interval.
+    Through as many checks as there are knots, or through Chebyshev points in time if that misses
+    the torque at the other checks. SolverError if the motion all but stops in an interval.
     """
-    k, (knots, checks) = data.grid.nonempty, data.sampling
-    spans = motion.durations(knots)
+    spans, count = motion.durations(data.sampling.checks), len(data.sampling.knots)
     if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
         raise SolverError("the motion all but stops between two nodes; plan with more intervals")
-    breaks = np.append(motion.times[k], motion.times[-1])
-    values = data.knots.forces.tau(*data.interpolate(motion.profile, knots))
-    torque = _fit(breaks, spans, values)
-    times = motion.times[k, None] + motion.durations(checks)
-    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(k))
-    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    torque, misfit = _fit(data, motion.profile, spans, count)
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, PLACES - 1)
+        torque = TorqueProfile.fit(torque.breaks, lambda t: motion.evaluate(t).tau, KNOTS - 1)
     return torque
 
 
@@ -240,18 +224,25 @@ def find_torques(
     data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
 ) -> tuple[Array, Array]:
     """Torques and their rates, (n_solid, 2, LOOKS) [N m, N m/s], at evenly spaced times."""
-    checks, count = data.sampling.checks, len(data.grid.nonempty)
-    picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
-    places, fractions = data.checks.pick(np.tile(picked, count)), checks[picked]
-    spans = np.concatenate([motion.durations(fractions) for motion in motions])
-    values = places.forces.tau(*data.interpolate(profile, fractions))
-    torque = _fit(np.append(0.0, np.cumsum(spans[:, -1])), spans, values)
-    looks = np.linspace(-1, 1, LOOKS)
-    return torque.at_places(looks), torque.slopes.at_places(looks)
+    spans = np.concatenate([motion.durations(data.sampling.checks) for motion in motions])
+    torque, _ = _fit(data, profile, spans, KNOTS)
+    samples = np.linspace(-1, 1, RATE_SAMPLES)
+    return torque.at_places(samples), torque.slopes.at_places(samples)
 
 
-def _fit(breaks: Array, spans: Array, tau: Array) -> TorqueProfile:
-    """Polynomials in time through torques at `spans` since the breaks, (n, m) [s]."""
+def _fit(
+    data: PhaseData, profile: Profile, spans: Array, min_count: int
+) -> tuple[TorqueProfile, Array]:
+    """Polynomials in time through torques at `min_count` checks or more; all errors, (n, m, 2).
+
+    The checks of each interval are `spans` after its start, (n, m) [s].
+    """
+    of_tau = data.checks.values[:, data.limits.of(TORQUE)]
+    tau = apply(of_tau, *data.interpolate(profile, data.sampling.checks))
+    tau, step = tau.reshape(*spans.shape, 2), (spans.shape[1] - 1) // (min_count - 1)
     x = 2 * spans / spans[:, -1:] - 1
-    coefficients = np.linalg.solve(x[..., None] ** np.arange(x.shape[1]), tau.reshape(*x.shape, 2))
-    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
+    powers = x[..., None] ** np.arange(len(x[0, ::step]))
+    coefficients = np.linalg.solve(powers[:, ::step], tau[:, ::step])
+    breaks = np.append(0.0, np.cumsum(spans[:, -1]))
+    torque = TorqueProfile(breaks, np.ascontiguousarray(coefficients.transpose(0, 2, 1)))
+    return torque, powers @ coefficients - tau

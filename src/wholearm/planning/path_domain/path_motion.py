@@ -98,18 +98,18 @@ class Grid(NamedTuple):
         sizes = np.ones_like(self.s)
         if not self.held:
             return sizes
-        for at, far in ((0, self.s - self.s[0]), (-1, self.s[-1] - self.s)):
-            first = np.diff(self.edges)[at, 0]
-            b = np.where(far < first, first * (far / first) ** (4 / 3), far)
+        for end, distance in ((0, self.s - self.s[0]), (-1, self.s[-1] - self.s)):
+            first = np.diff(self.edges)[end, 0]
+            b = np.where(distance < first, first * (distance / first) ** (4 / 3), distance)
             sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
         # The two ends are no unknowns.
         return np.pad(sizes[1:-1], 1, "edge")
 
-    def lean(self, by: float) -> Array:
+    def shrink(self, distance: float) -> Array:
         """The nodes, those at the ends of elements moved inwards a little [m]."""
         s = self.s.copy().reshape(-1, NODES)
-        s[:, 0] += by
-        s[:, -1] -= by
+        s[:, 0] += distance
+        s[:, -1] -= distance
         return s.ravel()
 
     def integrate(self, a: Array) -> Array:
@@ -145,13 +145,13 @@ def list_maps(bends: Array, rests: tuple[bool, bool] = (True, True), held: bool 
 def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
     """Bends of elements with these edges, each for the nearer one of the ends at rest."""
     length, bends = edges[-1, 1] - edges[0, 0], np.zeros(len(edges))
-    early = edges.mean(axis=1) - edges[0, 0] < length / 2
-    for sign, at, half in ((1, 0, early), (-1, -1, ~early)):
-        if rests[at]:
+    first_half = edges.mean(axis=1) - edges[0, 0] < length / 2
+    for sign, end, rows in ((1, 0, first_half), (-1, -1, ~first_half)):
+        if rests[end]:
             # A ramp of s'' takes 4/3 of the distance of constant s'' to the same speed.
-            distance = np.abs(edges[half] - edges[at, at]) - np.diff(edges)[at, 0] / 4
+            distance = np.abs(edges[rows] - edges[end, end]) - np.diff(edges)[end, 0] / 4
             near, far = np.sqrt(np.maximum(distance, 0.0))[:, ::sign].T
-            bends[half] = sign * (far - near) / (far + near)
+            bends[rows] = sign * (far - near) / (far + near)
     return bends
 
 
@@ -165,10 +165,10 @@ class Profile(NamedTuple):
 
 def follow(grid: Grid, a: Array, lam: Array) -> Profile:
     """The motion with these s'' and internal forces, s'' corrected so that it ends at rest."""
-    spread = np.ones_like(a)
+    weight = np.ones_like(a)
     if grid.held:
-        spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
-    a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
+        weight = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
+    a = a - grid.integrate(a)[-1] / grid.integrate(weight)[-1] * weight
     # At junctions with nearly no speed b may round to less than zero.
     b = np.maximum(grid.integrate(a), 0.0)
     b[-1] = 0.0
@@ -182,25 +182,25 @@ class Elements:
     """
 
     def __init__(self, grid: Grid, profile: Profile) -> None:
-        self.grid, basis, back = grid, find_basis(), grid.maps[:, 1] < 0
-        turn = back[:, None]
-        self._maps = np.where(turn, grid.maps @ BACKWARDS.T, grid.maps)
-        self._y = np.where(turn, 1 - basis.y, basis.y).ravel()
-        self._shares = self.find_share(np.arange(len(grid.s)), self._y)
-        self._starts = np.where(back, *grid.edges.T[::-1])
-        self._lengths = np.where(back, -1.0, 1.0) * np.diff(grid.edges)[:, 0]
-        table = np.stack([profile.a, profile.lam], axis=-1).reshape(len(back), NODES, 2)
-        self._motion = basis.to_powers @ np.where(turn[..., None], table[:, ::-1], table)
+        self.grid, basis, flipped = grid, find_basis(), grid.maps[:, 1] < 0
+        column = flipped[:, None]
+        self._maps = np.where(column, grid.maps @ BACKWARDS.T, grid.maps)
+        self._y = np.where(column, 1 - basis.y, basis.y).ravel()
+        self._parts = self.find_part(np.arange(len(grid.s)), self._y)
+        self._starts = np.where(flipped, *grid.edges.T[::-1])
+        self._lengths = np.where(flipped, -1.0, 1.0) * np.diff(grid.edges)[:, 0]
+        table = np.stack([profile.a, profile.lam], axis=-1).reshape(len(flipped), NODES, 2)
+        self._motion = basis.to_powers @ np.where(column[..., None], table[:, ::-1], table)
         # b' = 2 a, from where y is zero: for each power of the map one further power of y.
         count = 3 if grid.maps[:, 2].any() else 2
-        self._b = np.zeros((len(back), NODES + count))
-        self._b[:, 0] = np.where(back, *profile.b.reshape(-1, NODES)[:, [-1, 0]].T)
+        self._b = np.zeros((len(flipped), NODES + count))
+        self._b[:, 0] = np.where(flipped, *profile.b.reshape(-1, NODES)[:, [-1, 0]].T)
         a = 2 * self._lengths[:, None] * self._motion[..., 0]
         for power in range(1, count + 1):
             rises = power * self._maps[:, [power - 1]] * a / (POWERS + power)
             self._b[:, power : power + NODES] += rises
 
-    def find_share(self, k: Numbers, y: Array) -> Array:
+    def find_part(self, k: Numbers, y: Array) -> Array:
         """Part of the element before places y of intervals k."""
         slope, bend, cubic = self._maps[k // NODES].T
         return np.asarray(y * (slope + y * (bend + y * cubic)))
@@ -208,20 +208,20 @@ class Elements:
     def find_s(self, k: Numbers, y: Array) -> Array:
         """Places y of intervals k on the curves [m]."""
         element = k // NODES
-        return np.asarray(self._starts[element] + self._lengths[element] * self.find_share(k, y))
+        return np.asarray(self._starts[element] + self._lengths[element] * self.find_part(k, y))
 
     def find_stretch(self, k: Numbers, y: Array) -> Array:
         """Slope ds/dy at places y of intervals k [m]."""
         slope, bend, cubic = self._maps[k // NODES].T
         return np.asarray(self._lengths[k // NODES] * (slope + y * (2 * bend + 3 * y * cubic)))
 
-    def find_y(self, k: Numbers, done: Array, left: Array) -> Array:
-        """Local variable where parts of an interval, which add up to 1, are done and left."""
-        share = np.maximum(left * self._shares[k] + done * self._shares[k + 1], 0.0)
+    def find_y(self, k: Numbers, before: Array, after: Array) -> Array:
+        """Local variable where parts of an interval, which add up to 1, are before and after."""
+        part = np.maximum(after * self._parts[k] + before * self._parts[k + 1], 0.0)
         slope, bend, cubic = self._maps[k // NODES].T
-        root = slope + np.sqrt(slope**2 + 4 * bend * share) + cubic
-        y = 2 * share / np.maximum(root, np.finfo(float).tiny)
-        return np.where(cubic > 0, np.cbrt(share), y) if cubic.any() else y
+        root = slope + np.sqrt(slope**2 + 4 * bend * part) + cubic
+        y = 2 * part / np.maximum(root, np.finfo(float).tiny)
+        return np.where(cubic > 0, np.cbrt(part), y) if cubic.any() else y
 
     def find_ramps(self, k: Numbers) -> tuple[Flags, Array, Array]:
         """Which of the intervals k are next to rest, y at their starts, and its rise there."""
@@ -246,13 +246,13 @@ class Elements:
 
     def move(self, grid: Grid) -> Profile:
         """The profile at the nodes of another grid of the same curves."""
-        old = self.grid
+        source = self.grid
         # Of two nodes at one place, each belongs to the side of its element.
-        hair = 1e-9 * (old.s[-1] - old.s[0])
-        k = np.searchsorted(old.lean(hair), grid.lean(2 * hair), side="right") - 1
-        k = np.minimum(k + (k % NODES == DEGREE), len(old.s) - 2)
-        done = np.clip((grid.s - old.s[k]) / np.maximum(old.steps[k], 1e-300), 0.0, 1.0)
-        return self.evaluate(k, self.find_y(k, done, 1 - done))[0]
+        gap = 1e-9 * (source.s[-1] - source.s[0])
+        k = np.searchsorted(source.shrink(gap), grid.shrink(2 * gap), side="right") - 1
+        k = np.minimum(k + (k % NODES == DEGREE), len(source.s) - 2)
+        part = np.clip((grid.s - source.s[k]) / np.maximum(source.steps[k], 1e-300), 0.0, 1.0)
+        return self.evaluate(k, self.find_y(k, part, 1 - part))[0]
 
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes
@@ -299,47 +299,47 @@ class PathMotion:
         """
         k, (v0, v1) = self.grid.nonempty[n], (speed[n] for speed in self._ends)
         total = np.maximum(v0 + v1, _TINY)
-        done = w * (v0 * (2 - w) + v1 * w) / total
-        left = (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
+        before = w * (v0 * (2 - w) + v1 * w) / total
+        after = (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
         ramps, first, rise = self.elements.find_ramps(k)
-        return np.where(ramps, first + w * rise, self.elements.find_y(k, done, left))
+        return np.where(ramps, first + w * rise, self.elements.find_y(k, before, after))
 
     @cached_property
-    def _slowness(self) -> Array:
+    def _time_slopes(self) -> Array:
         """Slope of time over w and mean time, at Gauss points in each solid interval, (n, m)."""
         count = len(self.grid.nonempty)
         n, w = np.repeat(np.arange(count), _POINTS), np.tile((1 + _GAUSS) / 2, count)
         k, y, (v0, v1) = self.grid.nonempty[n], self._find_y(n, w), (v[n] for v in self._ends)
         ramps, _, rise = self.elements.find_ramps(k)
-        plain = rise * self.elements.find_stretch(k, y) * (v0 + v1) / (2 * self.grid.steps[k])
-        plain = np.where(ramps, plain, v0 * (1 - w) + v1 * w)
-        speed = np.maximum(self.elements.evaluate(k, y)[1], np.maximum(plain / _STALLED, _TINY))
-        return np.asarray((plain / speed).reshape(count, -1))
+        linear = rise * self.elements.find_stretch(k, y) * (v0 + v1) / (2 * self.grid.steps[k])
+        linear = np.where(ramps, linear, v0 * (1 - w) + v1 * w)
+        speed = np.maximum(self.elements.evaluate(k, y)[1], np.maximum(linear / _STALLED, _TINY))
+        return np.asarray((linear / speed).reshape(count, -1))
 
     @property
     def stalls(self) -> bool:
         """Whether the motion nearly stops between two nodes."""
         v0, v1 = self._ends
-        return bool((v0 + v1 <= _TINY).any() or self._slowness.max() >= _STALLED)
+        return bool((v0 + v1 <= _TINY).any() or self._time_slopes.max() >= _STALLED)
 
     @cached_property
-    def _clock(self) -> Array:
+    def _time_series(self) -> Array:
         """Legendre coefficients in 2 w - 1 of the time since each interval's start, (n, m + 1)."""
         v0, v1 = self._ends
         mean = self.grid.steps[self.grid.nonempty] / np.maximum(v0 + v1, _TINY)
-        return np.asarray(mean[:, None] * (self._slowness @ _INTEGRAL))
+        return np.asarray(mean[:, None] * (self._time_slopes @ _INTEGRAL))
 
     def durations(self, fractions: Array) -> Array:
         """Time from the start of each interval inside elements to a fraction of it, (n, m) [s]."""
         v0, v1 = (speed[:, None] for speed in self._ends)
-        here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
-        w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
-        k, done = np.repeat(self.grid.nonempty, len(fractions)), np.tile(fractions, len(w))
+        speed = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
+        w = fractions * (v0 + v1) / np.maximum(v0 + speed, _TINY)
+        k, part = np.repeat(self.grid.nonempty, len(fractions)), np.tile(fractions, len(w))
         ramps, first, rise = self.elements.find_ramps(k)
-        linear = np.clip((self.elements.find_y(k, done, 1 - done) - first) / rise, 0.0, 1.0)
+        linear = np.clip((self.elements.find_y(k, part, 1 - part) - first) / rise, 0.0, 1.0)
         w = np.where(ramps, linear, w.ravel()).reshape(w.shape)
         powers = legendre.legvander(2 * w - 1, _POINTS)
-        return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
+        return np.asarray(np.einsum("nmp,np->nm", powers, self._time_series))
 
     @property
     def duration(self) -> float:
@@ -357,13 +357,13 @@ class PathMotion:
         n = np.clip(np.searchsorted(self.times[nonempty], t, side="right") - 1, 0, None)
         k = nonempty[n]
         local = np.clip(t, 0.0, self.duration) - self.times[k]
-        w, clock = local / (self.times[k + 1] - self.times[k]), self._clock[n]
-        slope = legendre.legder(clock, axis=1)
+        w, series = local / (self.times[k + 1] - self.times[k]), self._time_series[n]
+        slope = legendre.legder(series, axis=1)
         for _ in range(5):  # iterations from a time to a place
             x = 2 * w - 1
-            late = np.einsum("np,np->n", legendre.legvander(x, _POINTS), clock) - local
+            residual = np.einsum("np,np->n", legendre.legvander(x, _POINTS), series) - local
             rate = 2 * np.einsum("np,np->n", legendre.legvander(x, _POINTS - 1), slope)
-            w = np.clip(w - late / rate, 0.0, 1.0)
+            w = np.clip(w - residual / rate, 0.0, 1.0)
         y = self._find_y(n, w)
         return self.elements.find_s(k, y), self.grid.segment[k], self.elements.evaluate(k, y)[0]
 

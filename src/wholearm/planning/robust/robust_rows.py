@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Numbers
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve, CurvePoint, directions_of
-from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
+from ...mechanics.dynamics import Directions, PathForces, apply, inverse
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
-from ...mechanics.path_limits import PathLimits
+from ...mechanics.path_limits import PathLimits, find_slack_rows, find_value_rows
 from ...mechanics.sensitivity import Sensitivity
 from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.definition import PARAMETERS, change_scene
@@ -60,10 +60,11 @@ class RobustLimits(NamedTuple):
         forces: PathForces,
         epsilon: float,
     ) -> Array:
-        """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
+        """Each force limit's rows h c, and their parametric bounds, shape (n, m, 1 + p, COUNT)."""
         slopes = Sensitivity.of_curve(formation, point, directions, forces).find_slopes(self.names)
-        changes = find_variations(formation, self.rows, self.names, slopes, forces.of_c, epsilon)
-        return changes * self.radii[:, None]
+        bounds = find_variations(formation, self.rows, self.names, slopes, forces.of_c, epsilon)
+        nominal = (self.rows @ forces.of_c)[:, :, None]
+        return np.concatenate([nominal, bounds * self.radii[:, None]], axis=2)
 
     def pick_signs(self, s: Array, segment: Numbers) -> NDArray[np.int8]:
         """Signs at places `s` of segments `segment`, shape (n, m, COPIES, p)."""
@@ -73,19 +74,6 @@ class RobustLimits(NamedTuple):
             places = self.s[sources]
             rows[targets] = sources[np.searchsorted((places[1:] + places[:-1]) / 2, s[targets])]
         return self.signs[rows]
-
-    def extend(self, of_c: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
-        """Contact forces, with the robust value of each copy of each limit as further columns."""
-        bounds = np.einsum("nmkp,nmpq->nmkq", signs, variations)
-        nominal = np.repeat(self.rows @ of_c, bounds.shape[2], axis=1)
-        return np.concatenate([of_c, nominal - bounds.reshape(nominal.shape)], axis=1)
-
-    def evaluate(
-        self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
-    ) -> Array:
-        """The left sides of the robust limits, shape (n, m) [N]."""
-        nominal = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
-        return np.asarray(nominal - np.abs(find_parametric_bounds(variations, motion)).sum(axis=2))
 
 
 def find_variations(
@@ -114,28 +102,33 @@ def find_variations(
     return np.asarray(variations)
 
 
-def find_parametric_bounds(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
-    """Parametric bounds of a motion, shape (n, m, p) [N]."""
-    return np.asarray(np.einsum("nmpq,nq->nmp", variations, stack_motion(*motion)))
+def evaluate_robust(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
+    """The left sides of the robust limits, shape (n, m) [N]."""
+    values = apply(variations, *motion)
+    return np.asarray(values[..., 0] - np.abs(values[..., 1:]).sum(axis=2))
 
 
 def repeat_limits(limits: LimitSet) -> LimitSet:
-    """Limits with `COPIES` rows for each force limit, in the columns that `extend` adds."""
-    width = len(limits.of(PRESS, CONE)) * COPIES
-    repeated, first = [], 0
+    """Limits with `COPIES` rows for each force limit."""
+    repeated = []
     for limit in limits.limits:
-        forces, joints = limit.rows[:, :-4], limit.rows[:, -4:]
-        rows = np.hstack([forces, np.zeros((len(forces), width)), joints])
-        changes: dict[str, Any] = {"rows": rows}
         if limit.kind in (PRESS, CONE):
-            count, begin = len(rows) * COPIES, forces.shape[1] + first
-            changes = {"rows": np.eye(rows.shape[1])[begin : begin + count], "viscous": True}
-            vectors = ("low", "high", "weight")
-            changes |= {name: np.repeat(getattr(limit, name), COPIES) for name in vectors}
-            changes["text"] = f"{limit.text} within all ranges,"
-            first += count
-        repeated.append(replace(limit, **changes))
+            changes: dict[str, Any] = {"text": f"{limit.text} within all ranges,"}
+            arrays = ("rows", "low", "high", "weight")
+            changes |= {name: np.repeat(getattr(limit, name), COPIES, axis=0) for name in arrays}
+            limit = replace(limit, **changes)
+        repeated.append(limit)
     return LimitSet(tuple(repeated))
+
+
+def widen(limits: LimitSet, values: Array, variations: Array, signs: NDArray[np.int8]) -> Array:
+    """Coefficients of the values of `repeat_limits`, (n, m', 5), from those of `limits`."""
+    is_force = np.isin(np.arange(len(limits.low)), limits.of(PRESS, CONE))
+    counts = np.where(is_force, COPIES, 1)
+    repeated, bounds = np.repeat(values, counts, axis=1), variations[:, :, 1:]
+    total = np.einsum("nmkp,nmpq->nmkq", signs, bounds).reshape(len(values), -1, values.shape[2])
+    repeated[:, np.repeat(is_force, counts)] -= total
+    return repeated
 
 
 def robustify(
@@ -158,25 +151,26 @@ def robustify(
     unsigned = RobustLimits(tuple(names), radii, rows, s, segment, zero)
     variations = unsigned.find_variations(formation, point, directions, forces, epsilon)
     a, b, lam = (np.interp(s, reference.s, column) for column in reference[1:])
-    signs = _find_signs(unsigned, limits, forces, variations, point.z_s[:, 3:], (a, b, lam))
-    return unsigned._replace(signs=signs)
+    values = find_value_rows(limits, forces, point.z_s[:, 3:])
+    return unsigned._replace(signs=_find_signs(limits, values, variations, zero, (a, b, lam)))
 
 
 def _find_signs(
-    unsigned: RobustLimits,
     limits: LimitSet,
-    forces: PathForces,
+    values: Array,
     variations: Array,
-    rates: Array,
+    signs: NDArray[np.int8],
     motion: tuple[Array, Array, Array],
 ) -> NDArray[np.int8]:
     """Signs of the rows that meet at the vertices of largest and least a, by cutting planes."""
-    repeated, signs, b = repeat_limits(limits), unsigned.signs.copy(), motion[1].copy()
-    signs[:, :, 4] = np.sign(find_parametric_bounds(variations, motion))
-    limits = limits.only(PRESS, CONE)
+    repeated, signs, b = repeat_limits(limits), signs.copy(), motion[1].copy()
+    bounds, copies = variations[:, :, 1:], repeated.of(PRESS, CONE)
+    forces = limits.only(PRESS, CONE)
+    signs[:, :, 4] = np.sign(apply(bounds, *motion))
     for iteration in range(8):  # cutting planes
-        extended = forces._replace(of_c=unsigned.extend(forces.of_c, variations, signs))
-        path_limits = PathLimits.of(repeated, extended, rates)
+        coefficients = widen(limits, values, variations, signs)
+        slack_rows = find_slack_rows(repeated, coefficients)
+        path_limits = PathLimits(slack_rows, np.full(len(b), np.inf))
         rows = path_limits.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
         ends = [path_limits.meet(b, path_limits.pair(row)) for row in extremes]
@@ -184,10 +178,10 @@ def _find_signs(
             b = np.where(ends[0][0] < ends[1][0], 0.5 * b, b)  # the polygon is empty
         for end, (a, lam) in enumerate(ends):
             vertex = np.nan_to_num(a), b, np.nan_to_num(lam)
-            slack = unsigned.evaluate(forces, variations, vertex) - limits.low
-            modelled = extended.c(*vertex)[:, unsigned.rows.shape[1] :].reshape(*slack.shape, -1)
-            violated = slack < modelled.min(axis=2) - limits.low - 1e-9 * limits.scales  # rounding
-            vertex_signs = np.sign(find_parametric_bounds(variations, vertex)).astype(np.int8)
+            slack = evaluate_robust(variations, vertex) - forces.low
+            modelled = apply(coefficients[:, copies], *vertex).reshape(*slack.shape, -1)
+            violated = slack < modelled.min(axis=2) - forces.low - 1e-9 * forces.scales  # rounding
+            vertex_signs = np.sign(apply(bounds, *vertex)).astype(np.int8)
             slots = (2 * end, 2 * end + 1) if iteration == 0 else (2 * end + iteration % 2,)
             for slot in slots:
                 signs[:, :, slot] = np.where(violated[..., None], vertex_signs, signs[:, :, slot])

@@ -35,7 +35,7 @@ from ...mechanics.dynamics import (
     metric_weights,
 )
 from ...mechanics.limits import SPEED, MotionLimit, make_limits
-from ...mechanics.path_limits import find_slack_rows
+from ...mechanics.path_limits import find_slack_rows, find_value_rows
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
 from ..path_domain.path_motion import PathMotion
@@ -403,7 +403,7 @@ def find_margin(path: PathGuess, epsilon: float, with_profile: bool = False) -> 
     point = CurvePoint(middles, z_s, z_ss, formation.evaluate(middles, z_s))
     forces = inverse(formation, point, Directions.of(point.kinematics, z_s))
     limits = make_limits(formation, epsilon).without(SPEED)
-    slack = find_slack_rows(limits, forces, z_s[:, 3:])
+    slack = find_slack_rows(limits, find_value_rows(limits, forces, z_s[:, 3:]))
     # Rows of s'' and s'^2 in the intervals, for b over the scene's squared speed and the margin.
     nodes, size = scene.scales.speed**2 * np.eye(m + 1, m + 2), m + 2
     motion = np.stack([np.diff(nodes, axis=0) / (2 * steps), (nodes[1:] + nodes[:-1]) / 2], axis=1)
