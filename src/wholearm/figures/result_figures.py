@@ -393,7 +393,8 @@ def _draw_plane(
     mesh = axes.pcolormesh(*borders, values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
         levels, masked = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
-        axes.contour(x, y, masked, levels).set(**CONTOUR)
+        # Lines that are bent would be filled with the colour.
+        axes.contour(x, y, masked, levels).set(**CONTOUR, facecolor="none")
     shades, reason_grid = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():
         mask = reason_grid == reason
