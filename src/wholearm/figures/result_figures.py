@@ -139,8 +139,9 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     for k, survival in enumerate(phase.survivals):
         colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
         look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
-        force = curves.force[survival.motion]
-        axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
+        # Where the force breaks off the curve falls through the lower edge.
+        force = np.maximum(curves.force[survival.motion], 2 * low)
+        axes.plot(curves.speed, force, zorder=3 + k, **look)
         if survival.speed:
             axes.plot(survival.speed, epsilon, "o", color=colour, markersize=5, zorder=6)
         again = "never" if survival.again is None else f"only from {survival.again:.3g} m/s on"
