@@ -158,8 +158,12 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     caption |= {"fontsize": 9 * min(1.0, 38 / len(title)), "fontweight": "bold"}
     style.write(axes, title, (0, 1), (0, 41), color=style.INK, **caption)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
-    long = curves.speed[-1] > 20.0 * curves.speed[0]
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if long else (1.0, 2.0, 3.0, 5.0)))
+    # Ticks are as dense as their labels allow: a digit is 5.7 points wide.
+    ends = np.log10(curves.speed[[0, -1]])
+    digits = max(len(f"{10.0 ** math.floor(end):g}".replace(".", "")) for end in ends)
+    label = (5.7 * digits + 6.0) * axes.figure.dpi / 72 / axes.bbox.width * np.ptp(ends)  # decades
+    ticks = (1.0, 2.0, 3.0, 5.0) if label < 0.17 else (1.0, 2.0, 5.0) if label < 0.3 else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(5))
