@@ -142,7 +142,7 @@ def test_figure_has_a_strip_of_one_scale_and_two_panels_with_units(figure: Figur
 
 @pytest.mark.parametrize(
     ("size", "prefix"),
-    [(5e-4, "m"), (2e-6, "\u00b5"), (2.0, ""), (400.0, ""), (16e3, "k"), (1e5, "k")],
+    [(5e-4, "m"), (2e-6, "\u00b5"), (3e-9, "n"), (400.0, ""), (16e3, "k"), (2e9, "M")],
 )
 def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))

@@ -142,6 +142,9 @@ def test_the_replay_holds_below_the_predicted_speed_and_not_above() -> None:
     assert phase.curves is not None
     expected = np.interp(0.98 * own.speed, phase.curves.speed, phase.curves.force[own.motion])
     assert np.nanmin(below.c_n) == pytest.approx(expected, abs=0.01)
+    k = int(np.searchsorted(phase.curves.speed, own.speed))
+    before, after = phase.curves.force[own.motion][k - 1 : k + 1]
+    assert before >= 0.05 > after and np.ptp(phase.curves.speed[k - 1 : k + 1]) < 1e-6
     above = replay(1.02 * own.lost)
     (lost,) = above.find(EventKind.CONTACT_LOST)
     assert lost.contact in own.first.contacts

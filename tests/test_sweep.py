@@ -212,6 +212,7 @@ def test_figures(box: Problem) -> None:
         for line in ([1.8, 1.6, 1.4, 1.2, 9.0], [1.9, 1.7, 1.5, 1.3, 9.0])
     ]
     assert [axes.get_xlabel() for axes in plane.axes] == ["mass [kg]", ""]
+    assert np.size(plane.axes[0].collections[1].get_facecolor()) == 0  # contours are lines
     assert plane.legends[0].get_texts()[0].get_text() == "too heavy: 2"
     vary = {"mass": mass, "epsilon": [0.0, 0.1], "x": [0.0, 0.001, 0.002]}
     panels = wholearm.draw_sweep(make(vary, box)).axes

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from ..common.arrays import Array, find_runs
+from ..common.arrays import Array, find_runs, sort_unique
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
@@ -132,10 +132,12 @@ def _predict_phase(
     zero = np.zeros_like(path.s)
     grasp = path.force_limits.find_best(zero, zero)
     kept = (grasp.least >= problem.epsilon) & (path.inertia > 0)
-    # Curves of least forces extend over all limit speeds.
+    # Curves of least forces extend over all limit speeds. They may break there: speeds just below
+    # and above are among the samples.
     limits = [s for each in survivals for s in (each.speed, each.lost, each.again) if s]
     ends = (0.36 * min(limits), 1.4 * max(limits)) if limits else (0.1 * unit, 10 * unit)
-    speeds = np.geomspace(*ends, 61)
+    breaks = np.outer([1 - 1e-7, 1 + 1e-7], limits)
+    speeds = sort_unique(np.append(np.geomspace(*ends, 61), breaks))
     forces = {
         name: np.array([evaluate(speed).force for speed in speeds.tolist()])
         for name, (evaluate, _) in motions.items()

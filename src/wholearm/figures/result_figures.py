@@ -139,8 +139,9 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     for k, survival in enumerate(phase.survivals):
         colour, (dash, _) = style.PALETTE[k], style.LINES[k % 3]
         look: Any = {"color": colour, "linestyle": dash, "linewidth": 1.9}
-        force = curves.force[survival.motion]
-        axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
+        # Where the force breaks off the curve falls through the lower edge.
+        force = np.maximum(curves.force[survival.motion], 2 * low)
+        axes.plot(curves.speed, force, zorder=3 + k, **look)
         if survival.speed:
             axes.plot(survival.speed, epsilon, "o", color=colour, markersize=5, zorder=6)
         again = "never" if survival.again is None else f"only from {survival.again:.3g} m/s on"
@@ -157,8 +158,12 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     caption |= {"fontsize": 9 * min(1.0, 38 / len(title)), "fontweight": "bold"}
     style.write(axes, title, (0, 1), (0, 41), color=style.INK, **caption)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
-    long = curves.speed[-1] > 20.0 * curves.speed[0]
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if long else (1.0, 2.0, 3.0, 5.0)))
+    # Ticks are as dense as their labels allow: a digit is 5.7 points wide.
+    ends = np.log10(curves.speed[[0, -1]])
+    digits = max(len(f"{10.0 ** math.floor(end):g}".replace(".", "")) for end in ends)
+    label = (5.7 * digits + 6.0) * axes.figure.dpi / 72 / axes.bbox.width * np.ptp(ends)  # decades
+    ticks = (1.0, 2.0, 3.0, 5.0) if label < 0.17 else (1.0, 2.0, 5.0) if label < 0.3 else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=ticks))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -393,7 +398,8 @@ def _draw_plane(
     mesh = axes.pcolormesh(*borders, values, vmin=low, vmax=high, cmap=look)
     if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
         levels, masked = MaxNLocator(LEVELS).tick_values(low, high), np.ma.masked_invalid(values)
-        axes.contour(x, y, masked, levels).set(**CONTOUR)
+        # Lines that are bent would be filled with the colour.
+        axes.contour(x, y, masked, levels).set(**CONTOUR, facecolor="none")
     shades, reason_grid = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
     for reason, colour in colours.items():
         mask = reason_grid == reason

@@ -79,7 +79,10 @@ def add_line(axes: Axes, points: Array, **look: Any) -> Artist:
 
 def choose_prefix(size: float) -> tuple[str, float]:
     """SI prefix with which values up to `size` have few digits, and the factor to it."""
-    steps = ((1e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
+    steps = (
+        (1e13, "T", 1e-12), (1e10, "G", 1e-9), (1e7, "M", 1e-6), (1e4, "k", 1e-3), (0.3, "", 1.0),
+        (3e-4, "m", 1e3), (3e-7, "\u00b5", 1e6), (0.0, "n", 1e9),
+    )  # fmt: skip
     return next((prefix, factor) for least, prefix, factor in steps if size >= least)
 
 

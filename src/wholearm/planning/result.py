@@ -258,8 +258,8 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
     suffix = f"; wrote {output}" if output else ""
     transitions = {
         "phase": "after phase:d", "velocity_ratio": "velocity ratio:.6f",
-        "least_impulse": "least impulse [N s per m/s]:.6f", "least_impulse_contact": "of",
-        "speed": "speed [m/s]:.6f", "saves": f"saves [{plan.unit}]:.6f", "stop": "",
+        "least_impulse": "least impulse [N s per m/s]:.6g", "least_impulse_contact": "of",
+        "speed": "speed [m/s]:.7g", "saves": f"saves [{plan.unit}]:.6g", "stop": "",
     }  # fmt: skip
     parts = [
         _list_phases(plan),

@@ -96,7 +96,8 @@ def _prepare_scene(
             # An arc of three quarters of a circle is the torque limit.
             angle = 1.5 * math.pi * torque / finger.torque_limit
             arc = _trace_arc(np.asarray(finger.base), angle, 0.05 * size)
-            artists.append(style.add_line(axes, arc, color=ACCENT, lw=1.6))
+            # Whole at the edge, too.
+            artists.append(style.add_line(axes, arc, color=ACCENT, lw=1.6, clip_on=False))
         return artists + plots.draw_joints(axes, scene)
 
     return draw
