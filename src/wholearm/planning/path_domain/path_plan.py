@@ -264,6 +264,15 @@ class Task:
         """The minimum-time speed profile of a sweep; None without one."""
         return find_fastest(join(self.lay_out()))
 
+    def share_out_switches(self, fastest: Fastest) -> list[Array]:
+        """The places of each curve where the minimum-time profile switches [m]."""
+        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
+        owner = np.searchsorted(starts[1:-1], fastest.switches)
+        return [
+            keep_apart(curve, fastest.switches[owner == k] - starts[k])
+            for k, curve in enumerate(self.curves)
+        ]
+
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
     """Raise an AmbiguityError if a uniqueness margin along the curve of a phase is below `least`.
@@ -323,12 +332,9 @@ class PathIterate:
         swept = task.options.goal is Objective.TIME and not task.is_held
         if swept and (fastest := find_fastest(data)):
             # Breaks at the switches, but on a curve where a fixed number of elements is too few.
-            starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-            owner = np.searchsorted(starts[1:-1], fastest.switches)
-            for k, curve in enumerate(task.curves):
-                on_curve = keep_apart(curve, fastest.switches[owner == k] - starts[k])
-                if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
-                    breaks[k] = on_curve
+            for k, places in enumerate(task.share_out_switches(fastest)):
+                if not task.options.intervals or len(find_ends(task.curves[k], places)) <= elements:
+                    breaks[k] = places
             parts = task.lay_out(elements, breaks)
             profile = guess_below(join(parts), fastest)
         return PathIterate(task, parts, units, profile, task.options.goal)
