@@ -51,7 +51,7 @@ Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
-_LOOKS = 17  # places of a segment at which uniqueness is checked
+_LOOKS = 65  # places of a segment at which uniqueness is checked; minima are narrow
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
 WORTH = 0.02  # largest relative cost of a start that friction cannot hold (`SureStart`)
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
@@ -227,6 +227,7 @@ class Task:
     start: SureStart | None = None
     guides: tuple[Reference, ...] = ()  # with ranges a reference for each curve
     pins: Pins = (None, None)
+    others: Mapping[int, Curve] = field(default_factory=dict)  # of other phases, for advice
 
     @cached_property
     def spreads(self) -> list[RobustLimits | None]:
