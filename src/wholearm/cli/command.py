@@ -916,7 +916,7 @@ def _policy(options: argparse.Namespace) -> int:
             show_progress(f"trying {words}")
             with suppress(WholearmError):
                 motion = plan if scene is problem else planner(scene)
-                if find_policy(scene, motion, **({"contact_speed": 1.0} | values | changes))[1].ok:
+                if find_policy(scene, motion, **(values | changes))[1].ok:
                     return f"{words} would do"
         speeds = () if "contact_speed" in values else CONTACT_SPEEDS[1:]
         texts = [f"--contact-speed {speed:g}" for speed in speeds]

@@ -3,7 +3,9 @@
 **By multipliers.** At a solution the derivative of the value is the partial derivative of the
 Lagrangian (envelope theorem). The NLP of every block is built again for p + h and for p - h on the
 same mesh, and its Lagrangian evaluated at the plan's unknowns and multipliers: no solve, hence no
-noise of meshes. Curves are traced anew, as they depend on shapes and bases. A block over time with
+noise of meshes. Curves are traced anew, as they depend on shapes and bases, and elements move with
+the switches of the minimum-time profile: a switch that moves inside an element changes the error of
+the NLP's value to first order, though that error is small itself. A block over time with
 a free end is solved with the gradient of the later Lagrangians as the price of its end, so that all
 blocks together are stationary.
 
@@ -34,6 +36,7 @@ from ..mechanics.limits import LimitSet
 from ..planning.blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain import path_data, path_motion, path_plan
+from ..planning.path_domain.path_mesh import find_ends
 from ..planning.phase_plan import combine
 from ..planning.result import UNITS
 from ..planning.time_domain import solution, stage, time_nlp
@@ -126,10 +129,11 @@ def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
     SolverError if the block's plan is not the solution of these NLPs.
     """
     assert block.chain is not None
-    iterates, options = list[path_plan.PathIterate](), planning.options
+    iterates, marks = list[path_plan.PathIterate](), list[list[Array]]()
     for part in block.chain.split():
-        task = part.make_task(planning.problem.epsilon, options)
+        task = part.make_task(planning.problem.epsilon, planning.options)
         iterates.append(path_plan.plan_task(task))
+        marks.append(_find_marks(task))
     value = sum(iterate.objective for iterate in iterates)
     if abs(value - sum(plan.value for plan in block.plans)) > 1e-9 * value:
         raise SolverError("the start is one that friction cannot hold")
@@ -141,28 +145,38 @@ def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
             curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
             z = curves[-1].end
         parts = ImpactSequence(phases, curves).split()
-        for iterate, part in zip(iterates, parts, strict=True):
-            terms += _evaluate_path(iterate, part.continuous_curves, problem.epsilon)
+        for iterate, old, part in zip(iterates, marks, parts, strict=True):
+            changed = replace(iterate.task, curves=part.continuous_curves, epsilon=problem.epsilon)
+            terms += _evaluate_path(iterate, old, changed)
         return terms, z
 
     return evaluate
 
 
+def _find_marks(task: path_plan.Task) -> list[Array]:
+    """Ends of each curve, its reversals, and for least time switches of the sweep [m]."""
+    breaks = [np.zeros(0)] * len(task.curves)
+    if task.options.goal is Objective.TIME and (fastest := task.find_fastest()):
+        breaks = task.locate_switches(fastest)
+    return list(map(find_ends, task.curves, breaks))
+
+
 def _evaluate_path(
-    iterate: path_plan.PathIterate, curves: Sequence[Curve], epsilon: float
+    iterate: path_plan.PathIterate, marks: Sequence[Array], task: path_plan.Task
 ) -> Terms:
-    """Terms of a solution along other curves, on elements between the same reversals."""
-    task, nlp, units = iterate.task, iterate.nlp, iterate.units
+    """Terms of a solution with `marks` for another task, on elements between the same ones."""
+    nlp, units = iterate.nlp, iterate.units
     parts = list[path_data.PhaseData]()
-    last = len(curves) - 1
-    for k, (part, curve, phase) in enumerate(zip(iterate.parts, curves, task.phases, strict=True)):
-        old, new = ([0.0, *(s.stop for s in each.segments)] for each in (part.curve, curve))
+    last = len(task.curves) - 1
+    pairs = zip(marks, _find_marks(task), strict=True)
+    for k, (part, (old, new)) in enumerate(zip(iterate.parts, pairs, strict=True)):
+        curve, phase = task.curves[k], task.phases[k]
         if len(old) != len(new):
-            raise SolverError(f"in phase {phase} a reversal comes or goes")
+            raise SolverError(f"in phase {phase} a reversal or a switch comes or goes")
         edges, grid = np.interp(part.grid.edges, old, new), part.grid
         segment = grid.segment[:: path_motion.NODES]
         new_grid = path_motion.lay_out(edges, segment, (k == 0, k == last), task.is_held)
-        parts.append(path_data.prepare(curve, epsilon, new_grid, phase))
+        parts.append(path_data.prepare(curve, task.epsilon, new_grid, phase))
     changed = replace(iterate, parts=parts)
     data = changed.data
     x, p, bounds = iterate.pack(), changed.find_parameters(), changed.make_bounds()

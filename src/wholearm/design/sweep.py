@@ -244,8 +244,8 @@ class Sweep(Result):
     objective; `margin`, the least normal force beyond epsilon [N]; the `limit` that is active for
     the longest time, and its `share` of the duration; `duration1`, ... of the phases [s]; for each
     check "ok" or the failure. Without one: its `reason` in a few words, equal for similar points;
-    the smallest `change` of one number with which there is a plan, if one was found; the whole
-    `message`.
+    the smallest `change` of one number with which the phase has a plan, if one was found; the
+    whole `message`.
     """
 
     derived = ("reasons", "best")

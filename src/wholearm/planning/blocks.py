@@ -233,7 +233,10 @@ def plan_block(
     for part in chain.split():
         with charge(part.phases[0].number):
             duration = planning.sum_durations(part.phases)
-            plans += plan_curves(part.make_task(problem.epsilon, options, duration))
+            task = part.make_task(problem.epsilon, options, duration)
+            curves = enumerate(planning.curves, 1)
+            others = {number: curve for number, curve in curves if number not in task.phases}
+            plans += plan_curves(replace(task, others=others))
     return plans, chain
 
 

@@ -47,7 +47,7 @@ from .dwell import require_hold
 from .nlp import open_ledger, setting
 from .options import PlanOptions
 from .path_domain.path_data import fit_torque
-from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves
+from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, require_unique
 from .phase_plan import Piece, Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
@@ -262,7 +262,17 @@ def _find_least(task: Task, parameter: Parameter) -> float | None:
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
-    """Plan along the same curves with another value of a parameter, at low accuracy."""
+    """Plan along the same curves with another value of a parameter, at low accuracy.
+
+    Friction is that of other phases, too: it must neither jam these nor leave their contact forces
+    ambiguous. More of another limit allows them more.
+    """
+    if parameter.key.startswith(FRICTION) and task.others:
+        curves = [change_curve(curve, parameter.key, value) for curve in task.others.values()]
+        others = replace(task, curves=curves, phases=[*task.others], references=())
+        for curve, number in zip(curves, others.phases, strict=True):
+            require_unique(curve, task.options.uniqueness_margin, number)
+        others.lay_out()
     task = _change_task(task, parameter, value)
     if task.find_fastest() is None:
         raise SolverError("no motion keeps the limits")

@@ -51,7 +51,7 @@ Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 ALLOWED = 2.5e-7  # violation between nodes, over the limits' scales; relative for b and time
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
-_PLACES = 17  # places of a segment at which uniqueness is checked
+_PLACES = 65  # places of a segment at which uniqueness is checked; minima are narrow
 _START, _SMOOTH, _RATE = 12, 20, 40  # elements of a phase; for effort; under rate limits
 MAX_START_LOSS = 0.02  # largest relative cost of a start that friction cannot hold (`MovingStart`)
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
@@ -227,6 +227,7 @@ class Task:
     start: MovingStart | None = None
     references: tuple[Reference, ...] = ()  # with ranges a reference for each curve
     pins: Pins = (None, None)
+    others: Mapping[int, Curve] = field(default_factory=dict)  # of other phases, for advice
 
     @cached_property
     def robust_limits(self) -> list[RobustLimits | None]:
@@ -263,6 +264,15 @@ class Task:
     def find_fastest(self) -> Fastest | None:
         """The minimum-time speed profile of a sweep; None without one."""
         return find_fastest(join(self.lay_out()))
+
+    def locate_switches(self, fastest: Fastest) -> list[Array]:
+        """Places on each curve at which the minimum-time profile switches [m]."""
+        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
+        owner = np.searchsorted(starts[1:-1], fastest.switches)
+        return [
+            keep_apart(curve, fastest.switches[owner == k] - starts[k])
+            for k, curve in enumerate(self.curves)
+        ]
 
 
 def require_unique(curve: Curve, required: float, phase: int) -> None:
@@ -323,12 +333,9 @@ class PathIterate:
         from_sweep = task.options.goal is Objective.TIME and not task.is_held
         if from_sweep and (fastest := find_fastest(data)):
             # Breaks at the switches, but on a curve where a fixed number of elements is too few.
-            starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-            owners = np.searchsorted(starts[1:-1], fastest.switches)
-            for k, curve in enumerate(task.curves):
-                on_curve = keep_apart(curve, fastest.switches[owners == k] - starts[k])
-                if not task.options.intervals or len(find_ends(curve, on_curve)) <= elements:
-                    breaks[k] = on_curve
+            for k, places in enumerate(task.locate_switches(fastest)):
+                if not task.options.intervals or len(find_ends(task.curves[k], places)) <= elements:
+                    breaks[k] = places
             parts = task.lay_out(elements, breaks)
             profile = guess_below(join(parts), fastest)
         return PathIterate(task, parts, units, profile, task.options.goal)
