@@ -173,15 +173,21 @@ class HeldMotion:
         t = np.asarray(t, dtype=float)
         return self._evaluate(t, t > self.end)
 
-    def sample(self, count: int) -> tuple[Array, Samples]:
+    def sample(self, count: int, steps: Array) -> tuple[Array, Samples]:
         """`count` even rows until the motion ends, then rows of the dwell.
 
-        These are at its ends, and at the time from which on its torques are constant.
+        Those of the dwell are at its ends, and at the time from which on its torques are constant.
+        At times of `steps` [s] in the motion there are two rows, before and after the step.
         """
-        t = np.linspace(0.0, self.end, count)
-        if self.dwell is not None:
-            t = np.append(t, self.end + sort_unique(self.dwell.breaks[[0, -2, -1]]))
-        return t, self._evaluate(t, np.arange(len(t)) >= count)
+        even, tiny = np.linspace(0.0, self.end, count), 1e-12 * self.duration
+        steps = steps[(steps > tiny) & (steps < self.end - tiny)]
+        even = even[np.abs(even[:, None] - steps).min(axis=1, initial=np.inf) > tiny]
+        t = np.sort(np.concatenate([even, steps, steps]))
+        sides = np.sort(np.concatenate([even, steps - tiny, steps + tiny]))
+        rest = self.dwell.breaks[[0, -2, -1]] if self.dwell is not None else np.zeros(0)
+        rest, count = self.end + sort_unique(rest), len(t)
+        t, sides = np.append(t, rest), np.append(sides, rest)
+        return t, self._evaluate(sides, np.arange(len(t)) >= count)
 
     def _evaluate(self, t: Array, held: Flags) -> Samples:
         """Samples at times `t`; those with `held` are in the dwell."""
@@ -205,12 +211,15 @@ class HeldMotion:
 def assemble(
     motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
 ) -> Trajectory:
-    """Trajectory of consecutive motions, with `samples` rows for each one and two for its dwell."""
+    """Trajectory of consecutive motions, with `samples` rows for each one and two for its dwell.
+
+    Steps of held torques have two rows each, too.
+    """
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, start = [], [], 0.0
     for motion in motions:
         phase_motion = motion if isinstance(motion, HeldMotion) else HeldMotion(motion)
-        t, row = phase_motion.sample(samples)
+        t, row = phase_motion.sample(samples, torque.held_steps - start)
         rows.append(row.expand(motion.contacts, contacts))
         times.append(start + t)
         start += motion.duration

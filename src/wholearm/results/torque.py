@@ -88,6 +88,12 @@ class TorqueProfile:
         return np.asarray(self.coefficients[1:] @ signs - self.coefficients[:-1].sum(axis=2))
 
     @property
+    def held_steps(self) -> Array:
+        """Breaks between two pieces with constant torques, shape (n,) [s]."""
+        constant = np.asarray((self.coefficients[..., 1:] == 0).all(axis=(1, 2)))
+        return np.asarray(self.breaks[1:-1][constant[1:] & constant[:-1]])
+
+    @property
     def slopes(self) -> TorqueProfile:
         """Time derivative of the torques within the pieces [N m/s]."""
         slopes = np.zeros_like(self.coefficients)

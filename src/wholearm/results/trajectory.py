@@ -78,7 +78,7 @@ class Trajectory(Drawn):
     """A planned motion: samples for files and plots, motions for any instant."""
 
     # (n,) [s]: even in each phase of a plan; a time is repeated where torques and forces step:
-    # between phases, at the start of a dwell, and anywhere in a replay
+    # between phases, at the start of a dwell, between held torques, and anywhere in a replay
     t: Array
     z: Array  # z, z_dot, z_ddot (n, 5): degrees of freedom (q, theta) and their derivatives
     z_dot: Array
@@ -188,16 +188,22 @@ class Trajectory(Drawn):
         """Rows before which forces step, shape (k,).
 
         At a new phase, a step of the torques, and a reversal of sliding. Steps of torques below a
-        tenth of the largest are too small for figures.
+        tenth of the largest are too small for figures. Those of held torques are left out: lines
+        are upright there.
         """
-        torque, t = self.torque, self.t
+        torque, t, held = self.torque, self.t, self.torque.held_steps
+
+        def is_apart(times: Array, others: Array) -> Flags:
+            distances = np.abs(times[:, None] - others)
+            return np.asarray(distances.min(axis=1, initial=np.inf) > 1e-9 * self.duration)
+
         stepping = np.abs(torque.jumps).max(axis=1) > 0.1 * np.abs(torque.coefficients).max()
-        breaks = torque.breaks[1:-1]
-        inside = np.abs(breaks[:, None] - self.phase_starts).min(axis=1) > 1e-9 * self.duration
-        # At a repeated time, in a replay, the step is between the two rows.
+        # At a repeated time the step is between the two rows.
         repeated = np.flatnonzero(np.diff(t) == 0) + 1
-        single = np.setdiff1d(breaks[stepping & inside], t[repeated])
+        single = torque.breaks[1:-1][stepping]
+        single = single[is_apart(single, np.concatenate([self.phase_starts, t[repeated], held]))]
         steps = np.searchsorted(t, single, side="right")
+        repeated = repeated[is_apart(t[repeated], held)]
         phases = np.append(np.flatnonzero(np.diff(self.phase)) + 1, repeated)
         # Friction passes zero without a step if a contact rolls, and together with c_n.
         friction = np.where(self.rolling, 0.0, self.c_t * self.c_n)
