@@ -143,6 +143,7 @@ class Target(NamedTuple):
     epsilon: float  # [N]: least normal force
     time_weight: float = 0.0  # [(N m)^2]: for `effort`
     relaxation: Parameter | None = None  # the relaxed limit, for `relax`
+    keeps_gaps: bool = True  # whether gaps closed at the start may not close further
 
     @property
     def has_margin(self) -> bool:
@@ -233,7 +234,7 @@ def build_time_nlp(
         add_periods(rows, stages, layouts)
     if with_statics:
         hold_ends(rows, stages, layouts, scheme, target.epsilon)
-    elif not stages[0].smoothing:
+    elif target.keeps_gaps and not stages[0].smoothing:
         keep_open(rows, stages[0], layouts[0])
     if target.has_margin:
         cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
