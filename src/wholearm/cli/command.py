@@ -14,6 +14,7 @@ import math
 import os
 import posixpath
 import re
+import shlex
 import sys
 import time
 import warnings
@@ -1129,7 +1130,9 @@ def _new(options: argparse.Namespace) -> int:
 
     from ..mapping.formation_list import write_template
 
-    output, vertices = f"{options.name.removesuffix('.toml')}.toml", None
+    if Path(name := options.name.removesuffix(".toml")).name in ("", ".."):
+        raise InputError("", "NAME", f"{options.name!r} given; needed is the name of a file")
+    output, vertices = f"{name}.toml", None
     require_writable(output)
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
@@ -1145,7 +1148,8 @@ def _new(options: argparse.Namespace) -> int:
     with name_source("--vertices" if vertices is not None else ""):
         content = write_template(Path(output).stem, **size, vertices=vertices)
     write_text(output, content)
-    print(f"wrote {output}; next: wholearm solve {output}")
+    path = f"./{output}" if output.startswith("-") else output
+    print(f"wrote {output}; next: wholearm solve {shlex.quote(path)}")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -558,7 +559,7 @@ dry = {_format(0.01 * mass_ratio * scale)} # N m, dry friction of the joint
 torque_limit = {_format(2.0 * mass_ratio * scale)} # N m"""
     text = f"""\
 # A polygon with {len(vertices)} corners slides to the left on edge 0. Units: m, kg, s, rad.
-name = "{name}"
+name = {json.dumps(name, ensure_ascii=False)}
 epsilon = {_format(0.05 * mass_ratio)} # N, least normal force of every contact
 gravity = 9.81 # m/s^2
 
