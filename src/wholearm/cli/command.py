@@ -528,8 +528,9 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     if policy_path is not None:
         policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
         origins.append(("policy", policy_path, policy.about))
-    problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
     with name_source(path):
+        describe_origin(problem, plan.meta, "plan")  # another object is no goal that is missed
+        problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
         require_same_contacts(problem, plan)
     for what, source, meta in origins:
         with name_source(source):
