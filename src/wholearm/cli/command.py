@@ -149,7 +149,7 @@ files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 [[route]]  find the contact formations that lead to a goal, and plan
 problem           problem file (TOML) with [goal] in place of [[phases]]
 -o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
---alternatives N  number of routes of other formations to list with the best one = 0 in 0..100
+--alternatives N  number of further routes (other formations or stops) to list = 0 in 0..100
 --objective NAME  of the plans: time, effort or margin; routes are searched by time = time
 {SEARCH}{JSON}\
 [[map]]  draw the contact formations over (x, phi)

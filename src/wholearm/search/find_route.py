@@ -68,7 +68,7 @@ def find_route(
     objective : {"time", "effort", "margin"}
         Objective of the plans; the search for routes minimizes time.
     alternatives : int
-        Number of further routes, with other formations, that are planned.
+        Number of further routes that are planned; they differ in formations or stops.
     progress : callable, optional
         Called with short messages about the current step.
     cache : path-like, optional
