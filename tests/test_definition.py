@@ -263,6 +263,7 @@ def test_the_first_phase_may_let_go_of_what_touches() -> None:
         ('until = "v6-finger2"', 'until = "v2-palm"', "phases[2].until", "never reached"),
         ('until = "v6-finger2"', "until = { x = -9.0 }", "phases[2].until", "never reached"),
         ("phi_deg = -50.0", "phi_deg = 50.0", "phases[5].until", "phi = 50 deg is never reached"),
+        ("phi_deg = -50.0", "phi_deg = -50.0, x = 1", "phases[5].until", "way phi = -50 deg at x"),
         ('until = "v3-finger1"', "until = { x = 0.03 }", "phases[2].contacts", "does not touch"),
         ('["v1-palm", "v3-finger1", "v6-finger2", "v0-finger2"]', '["v1-palm", "v3-finger1"]',
          "phases[5].contacts", "does not touch at the end of phase 4"),

@@ -530,5 +530,4 @@ def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
 def test_minima_between_samples_are_of_fourth_order() -> None:
     samples = np.exp(np.arange(25.0) / 9) - 2.9 * np.arange(25.0) / 9
     least = find_minima(samples[None, :, None])[0, 0]
-    # The fifth derivative leaves 5e-7, parabolas 5e-5.
-    assert least == pytest.approx(2.9 * (1 - np.log(2.9)), abs=2e-6)
+    assert least == pytest.approx(2.9 * (1 - np.log(2.9)), abs=2e-6)  # theory 5e-7, parabolas 5e-5

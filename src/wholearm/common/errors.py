@@ -254,7 +254,8 @@ def require_vector(value: object, key: str, size: int) -> Array:
     """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
     import numpy as np
 
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(value, list | tuple) or len(value) != size:
         raise InputError("", key, f"{value!r} is not a list of {size} numbers")
     return frozen([require_number(item, key) for item in value])
 

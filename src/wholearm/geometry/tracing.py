@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -184,7 +184,7 @@ def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:
     """Trace a curve with four constraints from `z` along `heading`, (5,), to `until` or its end."""
     rho = formation.scene.polygon.gyration_radius
-    names = [limit.text for limit in formation.limits] + [str(until)]
+    names = [limit.text for limit in formation.limits] + [str(replace(until, pins=()))]
     targets = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     # A limit that is closed at the start, such as the end of a flush edge that the link does not
     # reach yet, does not end the phase.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import tomllib
@@ -31,7 +30,7 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import measure_speed
 from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem, place_start
-from ..problem.table import format_until
+from ..problem.table import format_until, write_toml
 from ..scene.model import PLACE, TURN, Polygon, Scene
 from .borders import Piece, Track, Window, cut, flush_track, label_inside, name_contacts, palm_track
 
@@ -559,7 +558,7 @@ dry = {_format(0.01 * mass_ratio * scale)} # N m, dry friction of the joint
 torque_limit = {_format(2.0 * mass_ratio * scale)} # N m"""
     text = f"""\
 # A polygon with {len(vertices)} corners slides to the left on edge 0. Units: m, kg, s, rad.
-name = {json.dumps(name, ensure_ascii=False)}
+{write_toml({"name": name}).rstrip()}
 epsilon = {_format(0.05 * mass_ratio)} # N, least normal force of every contact
 gravity = 9.81 # m/s^2
 

@@ -234,4 +234,7 @@ def _write(value: Any) -> str:
         return "[\n" + "".join(f"    {_write(item)},\n" for item in value) + "]"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_write, value)) + "]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
+    if isinstance(value, str | bool):
+        # TOML allows DEL in strings only escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)
