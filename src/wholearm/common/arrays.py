@@ -94,7 +94,7 @@ def find_minima(values: Array) -> Array:
     slope, curvature = (after - before) / 2, before - 2 * middle + after
     inside = (middle <= before) & (middle <= after) & (curvature > 0)
     third, fourth = np.zeros_like(slope), np.zeros_like(slope)
-    third[:, 1:-1] = (slope[:, 2:] - 2 * slope[:, 1:-1] + slope[:, :-2]) * inside[:, 1:-1]
+    third[:, 1:-1] = slope[:, 2:] - 2 * slope[:, 1:-1] + slope[:, :-2]
     fourth[:, 1:-1] = curvature[:, 2:] - 2 * curvature[:, 1:-1] + curvature[:, :-2]
     # Derivatives of the quartic.
     slope, curvature = slope - third / 6, np.maximum(curvature - fourth / 12, curvature / 2)

@@ -230,10 +230,8 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
         nodes[0, 0] = z / stage.unit_lengths(scales)
         stages[0] = replace(stages[0], guess=points[0]._replace(nodes=nodes))
         changed = solution.TimeSearch(problem, options)
-        nlp, relaxations = (
-            changed.build(stages),
-            [stage.LimitViolations.none(each) for each in stages],
-        )
+        nlp = changed.build(stages)
+        relaxations = [stage.LimitViolations.none(each) for each in stages]
         bounds, bounds_g = time_nlp.find_bounds(nlp, stages, changed.scheme, relaxations)
         x, parts = time_nlp.pack(points, nlp.layouts, 0.0), nlp.assembled[0]
         # Without a price of the end.
@@ -248,7 +246,7 @@ def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evalu
 
 
 def _adopt(part: stage.Stage, new: Problem) -> stage.Stage:
-    """A stage in the scene of a problem in own units."""
+    """A stage in the scene of a problem, in the scene's units."""
     until, approach = new.phases[part.phase].until, part.approach
     if approach is not None and until.value is not None:
         approach = approach[0], until.value, approach[2]
