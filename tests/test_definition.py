@@ -32,14 +32,7 @@ from wholearm.geometry.tracing import check_phases, trace_phase, trace_phases
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.plan import solve
 from wholearm.problem import read
-from wholearm.problem.read import (
-    TOP,
-    adopt_phases,
-    build_problem,
-    build_schema,
-    read_problem,
-    write_page,
-)
+from wholearm.problem.read import TOP, build_problem, build_schema, read_problem, write_page
 from wholearm.problem.table import (
     describe_phase,
     describe_scene,
@@ -47,7 +40,7 @@ from wholearm.problem.table import (
     write_table,
     write_toml,
 )
-from wholearm.results.adopt import describe_origin
+from wholearm.results.adopt import adopt_phases, describe_origin
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
@@ -784,3 +777,6 @@ def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:
     for goal in ({"phi_deg": phi + 1.0}, {"phi_deg": phi, "x": plan.q[-1, 0] + 1e-3}, {"flush": 6}):
         with pytest.raises(InputError, match=r"goal: the plan ends at .*, and not with"):
             adopt_phases(read_file(goal), plan.meta, plan.q[-1])
+    other = read_file({"phi_deg": phi + 1.0}).with_(vertices=[[0, 0], [0.08, 0], [0.04, 0.06]])
+    with pytest.raises(InputError, match=r"vertices: 7 entries in the plan, 3 here"):
+        adopt_phases(other, plan.meta, plan.q[-1])

@@ -13,8 +13,8 @@ from ..common.document import Document, Result, Table
 from ..common.errors import InputError, JammingError, SimulationError, name_source
 from ..common.files import require_ending
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases, require_phases
-from ..results.adopt import Torques, require_made_for, split_torques
+from ..problem.read import require_phases
+from ..results.adopt import Torques, adopt_phases, require_made_for, split_torques
 from ..results.report import Report
 from ..results.torque import read_notes, read_torque_csv
 from ..results.trajectory import Trajectory, load_trajectory

@@ -520,17 +520,15 @@ def load_plan(options: argparse.Namespace, path: str) -> LoadedPlan:
     Notes on plans for another problem are printed, or stored if the output is JSON or phases.
     InputError, with the file, if a plan or policy cannot be used for the problem.
     """
-    from ..problem.read import adopt_phases
-    from ..results.adopt import describe_origin, require_same_contacts
+    from ..results.adopt import adopt_phases, describe_origin, require_same_contacts
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
     policy_path, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
     if policy_path is not None:
         policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
         origins.append(("policy", policy_path, policy.about))
+    problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
     with name_source(path):
-        describe_origin(problem, plan.meta, "plan")  # another object is no goal that is missed
-        problem, notes = adopt_phases(problem, plan.meta, plan.q[-1], path), list[str]()
         require_same_contacts(problem, plan)
     for what, source, meta in origins:
         with name_source(source):

@@ -190,22 +190,6 @@ def read_stored_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
         return build_problem(table)
 
 
-def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
-    """A problem with goals, with the phases of a plan (its `meta`) in their place.
-
-    An `InputError` that names the plan's file `source` if the plan does not store its problem, or
-    its end `q`, (3,) [m, m, rad], is not the last goal.
-    """
-    if not problem.goals:
-        return problem
-    goal, (x, _, phi), tol = problem.goals[-1], q.tolist(), 1e-3
-    rotated = abs(goal.find_angle(problem.scene, phi) - phi) > tol
-    if rotated or (goal.x is not None and abs(goal.x - x) > tol * problem.scene.scales.length):
-        place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
-        raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
-    return replace(problem, phases=read_stored_problem(meta, source).phases, goals=())
-
-
 def _check_edge(scene: Scene, edge: object, key: str) -> None:
     count = scene.polygon.n_vertices
     if not isinstance(edge, int | np.integer) or isinstance(edge, bool) or not 0 <= edge < count:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Protocol
 
+from ..common.arrays import Array
 from ..common.document import Difference, describe_differences, find_differences
-from ..common.errors import InputError
+from ..common.errors import InputError, name_source
 from ..common.files import require_ending, write_text
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases, require_phases
+from ..problem.read import read_stored_problem, require_phases
 from ..problem.table import save_problem
 from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory
@@ -37,6 +40,24 @@ def split_torques(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
         reason = "allowed are a plan, a simulation, a report, a Trajectory and a TorqueProfile"
         raise InputError("", "what", f"{what!r} given; {reason}")
     return trajectory.torque, trajectory
+
+
+def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
+    """A problem with goals, with the phases of a plan (its `meta`) in their place.
+
+    An `InputError` that names the plan's file `source` if the plan does not store its problem, or
+    its end `q`, (3,) [m, m, rad], is not the last goal, as that of another object or hand.
+    """
+    if not problem.goals:
+        return problem
+    goal, (x, _, phi), tol = problem.goals[-1], q.tolist(), 1e-3
+    rotated = abs(goal.find_angle(problem.scene, phi) - phi) > tol
+    if rotated or (goal.x is not None and abs(goal.x - x) > tol * problem.scene.scales.length):
+        with name_source(source):
+            describe_origin(problem, meta)
+        place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
+        raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
+    return replace(problem, phases=read_stored_problem(meta, source).phases, goals=())
 
 
 def adopt_torques(
