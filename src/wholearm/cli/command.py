@@ -548,15 +548,15 @@ def _solve(options: argparse.Namespace) -> int:
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
-    output = options.output or f"{Path(options.problem).stem}.npz"
     plan_options = wholearm.PlanOptions(**list_given(options, *keys_of(wholearm.PlanOptions)))
+    problem = wholearm.load(options.problem)
+    output = options.output or f"{Path(options.problem).stem}.npz"
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
     require_with(options, "sample_rate", "interpolation")
     require_with(options, "torques", "sample_rate")
     interpolation = options.interpolation or "linear"
     choice("linear", "hold").read(interpolation, "interpolation")
-    problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
     if not problem.goals:
@@ -1145,7 +1145,9 @@ def _new(options: argparse.Namespace) -> int:
             fault = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
             raise InputError("", "--vertices", fault) from None
     with name_source("--vertices" if vertices is not None else ""):
-        content = write_template(Path(output).stem, **size, vertices=vertices)
+        # A file name may have bytes that no text has.
+        stem = os.fsencode(Path(output).stem).decode(errors="replace")
+        content = write_template(stem, **size, vertices=vertices)
     write_text(output, content)
     path = f"./{output}" if output.startswith("-") else output
     print(f"wrote {output}; next: wholearm solve {shlex.quote(path)}")

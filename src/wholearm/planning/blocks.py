@@ -122,7 +122,7 @@ def plan_blocks(
         return plan_each(planning, report)
     from .explain import unadvised
 
-    time_options = replace(options, objective=Objective.TIME, duration=None)
+    time_options = options.for_least_time()
     fastest = plan_each(replace(planning, options=time_options, free_ends=False), report).plans
     times = [plan.motion.duration for plan in fastest]
     duration = 2 * sum(times) if options.duration is None else options.duration

@@ -91,6 +91,8 @@ class PlanOptions:
         object.__setattr__(self, "objective", Objective(self.objective))
         if self.duration is not None and self.objective is not Objective.MARGIN:
             raise InputError("", "duration", "is for the objective margin only")
+        if self.time_weight != _DEFAULTS["time_weight"] and self.objective is not Objective.EFFORT:
+            raise InputError("", "time_weight", "is for the objective effort only")
         if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):
             raise InputError("", "certify", "is for the objective time only")
         if self.certify and self.robust:
@@ -114,6 +116,11 @@ class PlanOptions:
     def roughen(self) -> PlanOptions:
         """Copy with low accuracy, for plans that only have to exist."""
         return replace(self, accuracy=max(self.accuracy, 1e-2))
+
+    def for_least_time(self) -> PlanOptions:
+        """Copy with the objective of least time."""
+        weight: float = _DEFAULTS["time_weight"]
+        return replace(self, objective=Objective.TIME, duration=None, time_weight=weight)
 
     @property
     def goal(self) -> Objective:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -105,7 +104,7 @@ def plan_stops(
 
     if duration is None or len(parts) == 1:
         return plan_parts(options, [duration] * len(parts))
-    time_options = replace(options, objective=Objective.TIME, duration=None)
+    time_options = options.for_least_time()
     time_optimal = plan_parts(time_options, [None] * len(parts))
     times = [
         sum(plan.motion.duration for plan in time_optimal[start - bounds[0] : stop - bounds[0]])

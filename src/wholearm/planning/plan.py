@@ -319,8 +319,7 @@ def _find_widest(
     first = part.make_task(planning.problem.epsilon, planning.options)
 
     def scale(factor: float) -> PlanOptions:
-        wider = planning.options.scale_ranges(planning.problem.ranges, factor)
-        return replace(wider, objective=Objective.TIME, duration=None)
+        return planning.options.scale_ranges(planning.problem.ranges, factor).for_least_time()
 
     low, high, middle = 0.0, np.inf, min(1.0, limit)
     while low < limit and (np.isinf(high) or high - low > 0.01 * high):  # relatively

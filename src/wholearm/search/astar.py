@@ -364,7 +364,7 @@ class RoutePlanner:
         # Parts are planned for least time, and without control period.
         same_objective = options.goal is Objective.TIME and not scene.control_period
         if not same_objective:
-            options = replace(options, objective=Objective.TIME, duration=None)
+            options = options.for_least_time()
         if scene.control_period:
             problem, options = free_torques(problem, options)
         parts = self._plan_parts(route, problem, options.scale_ranges(problem.ranges))

@@ -31,7 +31,7 @@ from ..planning.blocks import (
     trace_block,
 )
 from ..planning.explain import unadvised
-from ..planning.options import Objective, PlanOptions
+from ..planning.options import PlanOptions
 from ..planning.phase_plan import PhasePlan, end_of, runs_along_curves
 from ..planning.plan import solve_with
 from ..planning.result import Plan
@@ -71,7 +71,7 @@ PartPlan = list[tuple[Phase, TimeMotion | None]]
 
 def coarsen(options: PlanOptions) -> PlanOptions:
     """Options of coarse plans, which do not depend on the objective and the accuracy."""
-    return replace(options, objective=Objective.TIME, duration=None, accuracy=COARSE, certify=False)
+    return replace(options.for_least_time(), accuracy=COARSE, certify=False)
 
 
 def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:

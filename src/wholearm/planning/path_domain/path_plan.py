@@ -99,7 +99,7 @@ def plan_curves(task: Task, explained: bool = True) -> Plans:
     rounding = ALLOWED * task.curves[0].formation.scene.scales.force
     if options.goal is Objective.MARGIN and iterate.plans[0].value < task.epsilon - rounding:
         if task.duration is not None:
-            fastest = replace(options, objective=Objective.TIME, duration=None)
+            fastest = options.for_least_time()
             least = plan_task(replace(task, options=fastest, duration=None)).plans
             where = f"{name_phases(phases, 'infeasible')}: "
             share_duration([plan.value for plan in least], task.duration, where)

@@ -634,7 +634,7 @@ def plan_with_impacts(
         # Without an impact in least time there is none in a longer duration.
         return with_stops(options, duration)
     # A duration that is too short with stops may be long enough without them.
-    time_options = replace(options, objective=Objective.TIME, duration=None)
+    time_options = options.for_least_time()
     stops, failure = list[int](), None
     try:
         stop_plans = with_stops(options if duration is None else time_options)
