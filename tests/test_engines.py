@@ -266,9 +266,8 @@ def test_an_engine_that_is_missing_or_unknown(
 ) -> None:
     command = ["replay", str(HEPTAGON), "plan.npz", "--engine"]
     assert main([*command, "bullet"]) == 2
-    assert capsys.readouterr().err == (
-        "wholearm: --engine: 'bullet' given; allowed are mujoco, drake\n"
-    )
+    words = "wholearm: --engine: 'bullet' given; allowed are 'mujoco' and 'drake'\n"
+    assert capsys.readouterr().err == words
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main([*command, "drake"]) == 2
     assert capsys.readouterr().err == (

@@ -340,6 +340,10 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, unknown
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # That of argparse ignores errors of the output.
+        print(message, end="", file=file, flush=True)
+
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
         raise InputError("", "", f"{message.removeprefix('argument ')}; see {self.prog} --help")
@@ -1136,7 +1140,7 @@ def _new(options: argparse.Namespace) -> int:
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
     size = list_given(options, "polygon", "size", "mass")
-    if text := options.vertices:
+    if (text := options.vertices) is not None:
         for key in [key for key in size if key != "mass"]:
             raise InputError("", f"--{key}", f"{size[key]} given; --vertices has the corners")
         try:

@@ -17,7 +17,7 @@ _T = TypeVar("_T")
 _P = ParamSpec("_P")
 _BUILT_IN: dict[str, Any] = {"str": str, "Path": os.PathLike, "PathLike": os.PathLike}
 _BUILT_IN |= {"tuple": tuple | list, "Mapping": Mapping, "Callable": Callable}
-_CLASSES = {*wholearm.__all__, "Figure"}
+_CLASSES = {*wholearm.__all__, "Figure", "Route"}
 
 
 def _fits(value: Any, kind: ast.expr) -> bool:

@@ -106,7 +106,8 @@ def choice(*words: str) -> FieldKind:
     """One of several words, or the enumeration member with this value."""
 
     def read(value: Any, key: str) -> Any:
-        if getattr(value, "value", value) not in words:
+        word = getattr(value, "value", value)
+        if not isinstance(word, str) or word not in words:
             allowed = " and ".join(map(repr, words)) if len(words) == 2 else str(words)[1:-1]
             raise InputError("", key, f"{value!r} given; allowed are {allowed}")
         return value
@@ -118,6 +119,8 @@ def _read_type(kind: type, text: str) -> Callable[[Any, str], Any]:
     """Reader of values of one type; messages are the value followed by `text`."""
 
     def read(value: Any, key: str) -> Any:
+        if hasattr(value, "dtype") and hasattr(value, "item") and not value.ndim:
+            value = value.item()
         if not isinstance(value, kind):
             raise InputError("", key, f"{value!r} {text}")
         return value

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array, Flags, IndependentRows, Numbers, find_runs, sort_unique
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InputError, WholearmError
+from ..common.fields import choice
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop, Policy
@@ -509,16 +510,15 @@ def require_engine(name: str) -> Engine:
 
     InputError if there is no such engine, or it is not installed.
     """
-    if name not in ENGINES:
-        raise InputError("", "--engine", f"{name!r} given; allowed are {', '.join(ENGINES)}")
+    choice(*ENGINES).read(name, "engine")
     if importlib.util.find_spec(ENGINES[name].package) is None:
         text = f"{name} is not installed; pip install 'wholearm[{name}]'"
-        raise InputError("", "--engine", text)
+        raise InputError("", "engine", text)
     try:
         importlib.import_module(ENGINES[name].package)
     except ImportError as error:
         # For example MuJoCo 4 without mujoco-core.
-        raise InputError("", "--engine", f"{name}: {' '.join(str(error).split())}") from None
+        raise InputError("", "engine", f"{name}: {' '.join(str(error).split())}") from None
     engine: Engine = importlib.import_module(f".{name}", __package__).play
     return engine
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.arguments import checked
 from ..common.arrays import Array, Numbers, round_to
 from ..common.errors import (
     InfeasibleError,
@@ -20,6 +21,7 @@ from ..common.errors import (
     require_number,
     require_vector,
 )
+from ..common.fields import keys_of
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
@@ -146,6 +148,7 @@ def _begin(
     return problem.start, None, corners, [note]
 
 
+@checked
 def format_route(route: Route) -> str:
     """The route as ``[[phases]]`` with comments, ready to paste into a problem file."""
     first, last = describe_pose(route[0].start), describe_pose(route[-1].stop)
@@ -522,6 +525,9 @@ def write_template(
         raise InputError("", "--polygon", f"{polygon} given; allowed are 3 to 50")
     scale = require_number(size, "--size", positive=True) / _SIZE
     weight = _MASS * scale**2 if mass is None else require_number(mass, "--mass", positive=True)
+    if mass is None and keys_of(Polygon)["mass"].ranges[0].find_fault(weight):
+        text = f"none given, and that by --size {size:g} would be {weight:.3g} kg"
+        raise InputError("", "--mass", text)
     if vertices is None:
         angles = -math.pi / 2 + math.pi * (2 * np.arange(polygon) - 1) / polygon
         # Rounded, so that a corner above the centroid has x = 0.

@@ -84,7 +84,7 @@ class PlanOptions:
     uniqueness_margin: float = UNIQUENESS.default
     robust: float = _DEFAULTS["robust"]
     largest: bool = _DEFAULTS["largest"]
-    ranges: Mapping[str, float] = field(default_factory=dict)
+    ranges: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         read_keys(self)
@@ -104,6 +104,9 @@ class PlanOptions:
         """Copy with `factor` times a problem's ranges, by default `robust` times."""
         from ..problem.definition import PARAMETERS, read_widths
 
+        if factor is None and self.ranges:
+            text = "are those of the problem: problem.with_(uncertainty=...) changes them"
+            raise InputError("", "ranges", text)
         factor = self.robust if factor is None else factor
         widths = read_widths(given) if factor else {}
         ranges = {name: factor * width for name, width in widths.items()}

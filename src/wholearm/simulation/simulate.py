@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, SimulationError, require_array, require_number
-from ..common.fields import SHARE, Range
+from ..common.fields import SHARE, Range, choice
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import measure_gaps
 from ..problem.definition import Problem
 from ..problem.read import require_phases
-from ..results.adopt import Torques, adopt_torques
+from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .events import Energies, Outcome, Simulation, list_stretches
@@ -87,8 +87,7 @@ def simulate(
     SimulationError  if a formation does not close at its start, features overlap there, a law
                      gives no two numbers, or the step size underflows
     """
-    if contacts not in ("prescribed", "free"):
-        raise InputError("", "contacts", f"{contacts!r} given; allowed are prescribed and free")
+    contacts = choice("prescribed", "free").read(contacts, "contacts")
     tolerance = Range(1e-14, 1e-2).read(tolerance, "tolerance")
     instants = require_array(np.atleast_1d([] if times is None else times), "times", -1)
     if not np.isfinite(instants).all():
@@ -98,8 +97,9 @@ def simulate(
         if isinstance(what, Law) or start is not None or until is not None or restitution:
             text = "a law, start, until and restitution need contacts that are free"
             raise InputError("", "contacts", text)
-        problem, profile, _ = adopt_torques(problem, what)
+        problem, profile, plan = adopt_torques(problem, what)
         require_phases(problem)
+        require_same_contacts(problem, plan)
         run = Replay(problem, profile, tolerance, instants, minima)
         return _conclude(run, problem, *run.play(progress))
     state = require_array(problem.start if start is None else start, "start", -1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.arrays import Array, Numbers, find_lowest, sort_unique
 from ..common.errors import InputError
-from ..common.fields import POSITIVE, declare, key, read_keys
+from ..common.fields import POSITIVE, choice, declare, key, read_keys
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import FINGERS_TOUCH, evaluate_finger_gap
 from ..contacts.formation import Formation
@@ -126,14 +126,13 @@ def verify(
     InputError if the trajectory has other contacts than the problem, or a number is out of its
     range; JammingError, SimulationError if the simulation cannot go on.
     """
-    if contacts == "free":
+    if choice("prescribed", "free").read(contacts, "contacts") == "free":
         from .free import verify_free
 
         values = {"tolerance": tolerance, "departure": departure, "restitution": restitution}
         return verify_free(problem, what, progress=progress, **values)
-    if contacts != "prescribed" or restitution:
-        text = "restitution needs free ones" if restitution else f"{contacts!r} given"
-        raise InputError("", "contacts", f"{text}; allowed are prescribed and free")
+    if restitution:
+        raise InputError("", "restitution", "needs contacts that are free")
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)
