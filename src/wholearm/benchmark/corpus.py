@@ -41,7 +41,7 @@ from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
-from ..simulation.system import NODES
+from ..simulation.system import STAGE_TIMES
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
 from .stress import BASE, OBJECTIVES, STRANGE, change_tree, damage_torques
@@ -428,7 +428,7 @@ def count(problem: Problem) -> dict[str, int]:
     return counts | {
         "panels of curves": sum(len(curve.panels) for curve in trace_phases(problem)),
         "iterations": sum(run.iterations for run in runs),
-        "evaluations of the replay": len(NODES) * (replay.steps + replay.rejected),
+        "evaluations of the replay": len(STAGE_TIMES) * (replay.steps + replay.rejected),
     }
 
 

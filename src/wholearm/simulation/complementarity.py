@@ -33,7 +33,7 @@ from ..results.trajectory import interpolate_quintic
 from .events import EventKind, Outcome, OutcomeKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
-from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Modes, System
+from .system import EVENT_DELAY, ROUNDING_FORCE, ZERO_ACCEL, ZERO_SPEED, ContactRows, Modes, System
 
 FRICTION_MARGIN = 1e-9  # friction margin that counts as zero, over its bound or the largest force
 RATE_TOLERANCE = 1e-6  # difference of equal rates, over the largest rate without contact forces
@@ -277,10 +277,10 @@ class ClosedContacts:
         self.system, self.pairs, self.rows, v_t = system, pairs, rows, rows.A_t @ v
         self.mu = system.friction[list(pairs)]
         frictional = self.mu > 0
-        is_slow = np.abs(v_t) < STANDING * system.scales.speed
+        is_slow = np.abs(v_t) < ZERO_SPEED * system.scales.speed
         self.Xi = np.where(frictional & ~is_slow, np.sign(v_t), 0.0)
         self.static = (frictional & is_slow).nonzero()[0]
-        is_slow = np.abs(v) < STANDING * system.units[system.n :]
+        is_slow = np.abs(v) < ZERO_SPEED * system.units[system.n :]
         self.sigma = np.where((system.dry > 0) & ~is_slow, np.sign(v), 0.0)
         self.joints = ((system.dry > 0) & is_slow).nonzero()[0]
 
@@ -295,9 +295,9 @@ class ClosedContacts:
     def force_problem(self, a_free: Array, rows: ContactRows) -> ContactProblem:
         """Contact problem of accelerations; `a_free`, (n,): those without contact forces."""
         system, static, zeros = self.system, self.static, np.zeros(len(self.joints))
-        G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ a_free + rows.bend
+        G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ a_free + rows.A_dot_v
         T = np.vstack([rows.A_t[static], np.eye(system.n)[self.joints]])
-        b_t = T @ a_free + np.append(rows.bend_t[static], zeros)
+        b_t = T @ a_free + np.append(rows.A_t_dot_v[static], zeros)
         owner, mu = np.append(static, zeros - 1).astype(int), np.append(self.mu[static], zeros)
         bound = np.append(0 * self.mu[static], system.dry[self.joints])
         return ContactProblem(1 / system.mass, rows.A, G, b_n, T, b_t, owner, mu, bound)
@@ -372,7 +372,7 @@ class FreeRun(Run):
         system, root_mass = self.system, np.sqrt(self.system.mass)
         for _ in range(5):
             # Project onto the closed contacts, in the metric M.
-            gaps, ranges = system.look(self.z)
+            gaps, ranges = system.measure_at(self.z)
             near = np.flatnonzero((np.abs(gaps) < max_gap) & (ranges > -max_gap)).tolist()
             if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
                 break
@@ -382,11 +382,11 @@ class FreeRun(Run):
             if self.t >= self.stop:
                 self.next_piece()
             closed = self._resolve_impacts()
-            was_moving = not self.stands
+            was_moving = not self.is_at_rest
             at_rest = self._select_modes(closed)
-            if was_moving and self.stands:
+            if was_moving and self.is_at_rest:
                 at_rest = self._select_modes(self._find_closed())
-            if not self.gets_on():
+            if not self.makes_progress():
                 names = " ".join(self.system.names[pair] for pair in closed.pairs)
                 return self._give_up(f"decisions on {names or 'joints'} do not end")
             failure = "no motion obeys the laws of contact" if at_rest is None else ""
@@ -428,23 +428,23 @@ class FreeRun(Run):
         return min_speed * self.system.scales.speed * 10.0**exponent
 
     def _is_still(self, acceleration: Array) -> bool:
-        return self.system.is_slower(acceleration * self.system.scales.time, STILL)
+        return self.system.is_slower(acceleration * self.system.scales.time, ZERO_ACCEL)
 
     def _find_facing(self, z: Array, v: Array) -> tuple[Array, Flags]:
         """Gaps of all pairs at a state [m], and whether they are in range, shape (N,) each."""
         scales = self.system.scales
-        gaps, ranges = self.system.look(z)
+        gaps, ranges = self.system.measure_at(z)
         tolerance = CLOSED_GAP * scales.length
-        facing = ranges > tolerance
-        at_end = (ranges > -tolerance) & ~facing
-        if np.count_nonzero(at_end):
-            facing |= at_end & (self.system.look(z + SETTLING * scales.time * v)[1] >= ranges)
-        return gaps, facing
+        faces = ranges > tolerance
+        edge = (ranges > -tolerance) & ~faces
+        if np.count_nonzero(edge):
+            faces |= edge & (self.system.measure_at(z + EVENT_DELAY * scales.time * v)[1] >= ranges)
+        return gaps, faces
 
     def _find_closed(self) -> ClosedContacts:
         system, unit = self.system, self.system.scales.length
-        gaps, facing = self._find_facing(self.z, self.v)
-        is_touching = (gaps < CLOSED_GAP * unit) & (gaps > -MAX_OVERLAP * unit) & facing
+        gaps, faces = self._find_facing(self.z, self.v)
+        is_touching = (gaps < CLOSED_GAP * unit) & (gaps > -MAX_OVERLAP * unit) & faces
         touching: list[int] = is_touching.nonzero()[0].tolist()
         rows = system.evaluate(self.z, self.v, touching)
         is_slow = (rows.A @ self.v < self.chatter_speed).tolist()
@@ -462,7 +462,7 @@ class FreeRun(Run):
 
     def _resolve_impacts(self) -> ClosedContacts:
         """Compute impacts until no closed gap closes further; returns the closed contacts."""
-        tolerance = STANDING * self.system.scales.speed
+        tolerance = ZERO_SPEED * self.system.scales.speed
         # After 30 impacts at one instant the last one is plastic.
         for count in range(31):
             closed = self._find_closed()
@@ -488,7 +488,7 @@ class FreeRun(Run):
             v = v_rebound if v_rebound**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
         interval = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
-            if rates[k] >= -STANDING * self.system.scales.speed or solution.c_n[k] <= 0:
+            if rates[k] >= -ZERO_SPEED * self.system.scales.speed or solution.c_n[k] <= 0:
                 continue
             name, text = self.system.names[pair], self.system.structure.pairs[pair].text
             kind, note = EventKind.CHATTER, f"the impacts of {name} come ever closer and are over"
@@ -504,14 +504,14 @@ class FreeRun(Run):
         """Apply an impact without collision (Painleve paradox); returns whether there is one."""
         system = self.system
         closed = self._find_closed()
-        a = system.push(self.v, self.tau(self.t), closed.sigma) / system.mass
-        impact = solve_problem(closed.impact_problem(self.v + SETTLING * system.scales.time * a))
+        a = system.sum_forces(self.v, self.tau(self.t), closed.sigma) / system.mass
+        impact = solve_problem(closed.impact_problem(self.v + EVENT_DELAY * system.scales.time * a))
         if impact is None:
             return False
         # The same impact without the delay, in the modes of its solution.
         problem = closed.impact_problem(self.v)
         solutions = list_solutions(problem, problem.find_choice(impact))
-        if not solutions or system.is_slower(solutions[0].change, STANDING):
+        if not solutions or system.is_slower(solutions[0].change, ZERO_SPEED):
             return False
         names = " ".join(system.names[pair] for pair in closed.pairs)
         text = f"no finite forces keep {names} closed: an impact without a collision"
@@ -522,7 +522,7 @@ class FreeRun(Run):
     def _select_modes(self, closed: ClosedContacts) -> bool | None:
         """Set the contact modes; returns whether all is at rest, None without consistent modes."""
         system, inverse_mass = self.system, 1 / self.system.mass
-        if (np.abs(closed.rows.A @ self.v) > STANDING * system.scales.speed).any():
+        if (np.abs(closed.rows.A @ self.v) > ZERO_SPEED * system.scales.speed).any():
             # Closed contacts that open more slowly than `chatter_speed` remain closed.
             pairs, rows = closed.pairs, closed.rows
             is_slow = np.abs(rows.A_t @ self.v) < self.chatter_speed
@@ -530,21 +530,21 @@ class FreeRun(Run):
             self.project_velocity(np.vstack([rows.A, rows.A_t[is_slow]]))
             rows = system.evaluate(self.z, self.v, pairs)
             closed = ClosedContacts(system, pairs, rows, self.v)
-        delay = SETTLING * system.scales.time
-        a_free = inverse_mass * system.push(self.v, self.tau(self.t), closed.sigma)
+        delay = EVENT_DELAY * system.scales.time
+        a_free = inverse_mass * system.sum_forces(self.v, self.tau(self.t), closed.sigma)
         present = self._solve(closed.force_problem(a_free, closed.rows), closed.encode(self.modes))
         if present is None:
             return None
         acceleration = a_free + present.change
         v = self.v + delay * acceleration
         rows = system.evaluate(self.z + delay * (self.v + v) / 2, v, closed.pairs)
-        a_later = inverse_mass * system.push(v, self.tau(self.t + delay), closed.sigma)
+        a_later = inverse_mass * system.sum_forces(v, self.tau(self.t + delay), closed.sigma)
         solution = self._select(closed, closed.force_problem(a_later, rows), a_later, present)
         if solution is None:
             return None
         # At rest the last modes may be left by rounding, for others that are also at rest.
         is_still = self.resting or self._is_still(acceleration)
-        at_rest = self.stands and is_still and self._is_still(a_later + solution.change)
+        at_rest = self.is_at_rest and is_still and self._is_still(a_later + solution.change)
         modes = closed.make_modes(solution, rows)
         self._note_changes(closed.pairs, modes, at_rest)
         self.modes = modes
@@ -601,7 +601,7 @@ class FreeRun(Run):
         gained = [pair for pair in modes.kept if pair not in before.kept]
         tolerance = CLOSED_GAP * system.scales.length
         for pair in lost:
-            gaps, ranges = system.look(self.z)
+            gaps, ranges = system.measure_at(self.z)
             # A closed contact at the end of its range continues on a neighbouring feature.
             successors = [p for p in gained if names[p][-1:] == names[pair][-1:]]
             if successors and abs(gaps[pair]) < tolerance and ranges[pair] < tolerance:
@@ -680,7 +680,7 @@ class FreeRun(Run):
         for tau in np.vstack([np.zeros(2), self.system.scales.torque * np.eye(2)]):
             torque[:] = 0.0
             torque[:: self.torque.coefficients.shape[2]] = tau
-            s.look()
+            s.evaluate_state()
             rates = s.outputs.acceleration * self.system.scales.time
             margins = s.outputs.values[: s.rows.cone.stop]
             samples.append(np.concatenate([margins, rates / self.system.units[self.system.n :]]))
@@ -694,7 +694,7 @@ class FreeRun(Run):
         # Contacts may be nearly dependent. Cases: two fingers that rest on each other; hexagon with
         # v0 below finger 2's joint.
         margins[:, 0] += np.maximum(ROUNDING_FORCE, -2 * margins @ powers)
-        rate_margins[:, 0] += np.maximum(10 * STILL, 2 * np.abs(rate_margins @ powers))
+        rate_margins[:, 0] += np.maximum(10 * ZERO_ACCEL, 2 * np.abs(rate_margins @ powers))
         return np.vstack([margins, rate_margins])
 
     # Motion.
@@ -706,7 +706,7 @@ class FreeRun(Run):
         self.monitored = ~np.isin(range(len(self.system.names)), self.kept)
         self.counts = [slices.cone.stop, slices.turn.stop - slices.cone.stop, len(self.kept)]
         self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED_GAP], self.counts)
-        self.look()
+        self.evaluate_state()
         # Touching pairs may overlap by rounding; pairs with a larger overlap never close.
         gaps = self.step_end.gaps
         levels = np.minimum(gaps, 0.0) - 0.5 * CLOSED_GAP * self.unit
@@ -718,9 +718,9 @@ class FreeRun(Run):
             # Half the time in which a pair that has just opened would close again. Pairs that open
             # more slowly were closed when the modes were selected.
             rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
-            rate, bend = rows.A @ self.v, rows.A @ self.s.outputs.acceleration + rows.bend
-            closing = (rate >= self.chatter_speed) & (bend < 0)
-            self.h = float((-rate[closing] / bend[closing]).min(initial=self.h))
+            rate, growth = rows.A @ self.v, rows.A @ self.s.outputs.acceleration + rows.A_dot_v
+            closing = (rate >= self.chatter_speed) & (growth < 0)
+            self.h = float((-rate[closing] / growth[closing]).min(initial=self.h))
         self.record()
         super().move()
 
@@ -738,7 +738,7 @@ class FreeRun(Run):
         outputs = self.s.outputs
         motion = np.concatenate([outputs.y[: 2 * self.system.n], outputs.acceleration])
         motion = motion.reshape(3, self.system.n)
-        self.step_end = StepEnd(motion, *self.system.look(motion[0]))
+        self.step_end = StepEnd(motion, *self.system.measure_at(motion[0]))
         return np.concatenate([outputs.values, self.step_end.ranges[self.kept] / self.unit])
 
     def pass_break(self) -> bool | None:
@@ -746,7 +746,7 @@ class FreeRun(Run):
         if not self.next_piece():
             return True
         if self.steps_at[self.piece]:
-            self.look()
+            self.evaluate_state()
             if not self._modes_persist():
                 return True
             self.record()
