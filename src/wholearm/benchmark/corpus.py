@@ -35,7 +35,7 @@ from wholearm import Plan, Problem
 from ..common.document import Table, to_plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import check_phases, trace_phases
-from ..planning.nlp import open_ledger
+from ..planning.nlp import collect_costs
 from ..problem.read import build_problem
 from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
@@ -413,8 +413,8 @@ def count(problem: Problem) -> dict[str, int]:
     Sizes are those of the first NLP of each block, such as "phase 5-6 of 6: rows".
     """
     notes = list[tuple[str, int]]()
-    with open_ledger() as ledger:
-        runs = ledger.runs
+    with collect_costs() as costs:
+        runs = costs.runs
         plan = wholearm.solve(
             problem, replay=False, progress=lambda text: notes.append((text, len(runs)))
         )

@@ -45,10 +45,10 @@ from ..nlp import (
     Kernel,
     NlpRows,
     SolverStatistics,
-    book,
+    add_cost,
     build_kernel,
     build_solver,
-    share,
+    cached_kernel,
 )
 from ..options import Objective
 from .stage import LimitViolations, Scheme, Stage, StagePoints, bernstein, make_scheme
@@ -244,7 +244,7 @@ def build_time_nlp(
     N = tangent_basis(last_stage.formation, last_stage.guess.nodes[-1, 0])
     rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
     nlp = rows.assemble(cost, end_z)
-    book(SolverStatistics(build_time=time.perf_counter() - start_time))
+    add_cost(SolverStatistics(build_time=time.perf_counter() - start_time))
     return TimeNLP(nlp, max_iter, layouts, rows, rows_of, duration_row, 1 / (squares + weight))
 
 
@@ -628,7 +628,7 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
     # Stage, period, fraction of the stage and unknowns of each interval.
     owners = [k for k, stage in enumerate(stages) for _ in stage.periods]
     periods = [period for stage in stages for period in stage.periods]
-    share = np.concatenate([stage.guess.fractions for stage in stages])
+    ratio = np.concatenate([stage.guess.fractions for stage in stages])
     h, tau = (np.concatenate([getattr(part, name) for part in layouts]) for name in ("h", "tau"))
     first: Indices | None = None  # durations of the intervals of the first full period
     for _, intervals in groupby(range(len(h)), key=lambda i: stages[owners[i]].phase):
@@ -646,7 +646,7 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
                 first = h[parts]
             for k, next_k in pairwise(parts):
                 if owners[k] == owners[next_k]:
-                    weights = np.array([share[next_k], -share[k]]) / (share[k] + share[next_k])
+                    weights = np.array([ratio[next_k], -ratio[k]]) / (ratio[k] + ratio[next_k])
                     rows.add_entries(rows.linear(1), h[[k, next_k]], weights)
                 if linear:
                     slopes = {"before": tau[k].ravel(), "after": tau[next_k].ravel()}
@@ -727,7 +727,7 @@ def _drop_bounds(stage: Stage, rows: StageRows, scheme: Scheme, low_x: Array, lo
                 low_g[indices[0, 0]] = -np.inf
 
 
-@share
+@cached_kernel
 def point_kernel(formation: Formation, controls: int, smoothed: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
@@ -760,7 +760,7 @@ def point_kernel(formation: Formation, controls: int, smoothed: bool = False) ->
     )
 
 
-@share
+@cached_kernel
 def end_kernel(formation: Formation) -> Kernel:
     """Contacts at the end of an interval without a point there; `z_start` is z at its start."""
     x = Columns(z=5, v=5, z_start=5 * bool(formation.rolling)).make_symbols()
@@ -771,7 +771,7 @@ def end_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
-@share
+@cached_kernel
 def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
 
@@ -787,7 +787,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     return build_kernel(s, p, steps=N.T @ steps)
 
 
-@share
+@cached_kernel
 def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     """Limits of a formation."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
@@ -795,7 +795,7 @@ def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     return build_kernel(x, values=values)
 
 
-@share
+@cached_kernel
 def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
     """Second derivative of a contact's gap."""
     x = Columns(z=5, v=5, a=5).make_symbols()
@@ -819,7 +819,7 @@ def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
     return next((k for k in ends if values[k] < tolerance), None)
 
 
-@share
+@cached_kernel
 def goal_kernel(
     formation: Formation,
     until: Until | None,
@@ -863,7 +863,7 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
     return new + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
 
 
-@share
+@cached_kernel
 def effort_kernel(controls: int) -> Kernel:
     """Integral of tau^T tau over an interval, by the control points of tau."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -875,7 +875,7 @@ def effort_kernel(controls: int) -> Kernel:
     return build_kernel(x, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
-@share
+@cached_kernel
 def curvature_kernel(controls: int) -> Kernel:
     """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
@@ -889,7 +889,7 @@ def find_released(formation: Formation, following: Formation) -> list[int]:
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
 
 
-@share
+@cached_kernel
 def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     """Plastic impact onto the following formation: M5 (v+ - v-) = G+^T p, P+ v+ = 0.
 
@@ -913,7 +913,7 @@ def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     )
 
 
-@share
+@cached_kernel
 def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     """Slack of the control points of the commands, h (1 -+ command / limit)."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -929,7 +929,7 @@ def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     return build_kernel(x, p, slack=ca.vertcat(*slack))
 
 
-@share
+@cached_kernel
 def rest_kernel(formation: Formation) -> Kernel:
     """Static balance of gravity, torques and `forces`: c_n, c_t and friction of the joints."""
     scene, n_c = formation.scene, formation.n_contacts
@@ -941,7 +941,7 @@ def rest_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, balance=balance)
 
 
-@share
+@cached_kernel
 def brake_kernel(formation: Formation) -> Kernel:
     """Decelerations of sliding contacts and joints at z' = 0."""
     x = Columns(z=5, a=5).make_symbols()
@@ -951,7 +951,7 @@ def brake_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, p, brake=-ca.vertcat(slides, p.sigma * x.a[3:]))
 
 
-@share
+@cached_kernel
 def slope_kernel() -> Kernel:
     """Difference of the slopes of linear torques in two intervals, times both durations."""
     x = Columns(before=4, after=4, h=1, h_next=1).make_symbols()
