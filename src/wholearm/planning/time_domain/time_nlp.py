@@ -534,7 +534,7 @@ def add_statics(
 ) -> None:
     """Add static balance at both ends of a motion, and where it stops between phases.
 
-    The motion begins without acceleration, and with friction at its bound, as it is continuous. With
+    The motion begins without acceleration and with friction at its bound, as it is continuous. With
     one degree of freedom it also ends so. With more it may end with a deceleration; then the gained
     contact and friction at rest balance the torques.
     """
