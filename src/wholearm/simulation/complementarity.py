@@ -207,10 +207,9 @@ def list_solutions(p: ContactProblem, choice: Sequence[int] | None = None) -> li
 
 
 def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
-    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one.
+    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M, (n, n), is scaled.
 
-    Complementary pivoting until the artificial unknown z_0 leaves the basis. Returns z, (n,), and
-    the largest violation of these conditions, infinite on a ray.
+    Returns z, (n,), and the largest violation of these conditions, infinite on a ray.
     """
     n = len(q)
     if (q >= 0).all():
@@ -715,8 +714,7 @@ class FreeRun(Run):
         self.shift = np.maximum(self.slack, self.slack - self.values)
         near = self.monitored & (gaps <= MIN_GAP * self.unit) & (gaps > -CLOSED_GAP * self.unit)
         if near.any():
-            # Half the time in which a pair that has just opened would close again. Pairs that open
-            # more slowly were closed when the modes were selected.
+            # Half the time after which a pair that has just opened closes; slower ones are closed.
             rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
             rate, growth = rows.A @ self.v, rows.A @ self.s.outputs.acceleration + rows.A_dot_v
             closing = (rate >= self.chatter_speed) & (growth < 0)
@@ -817,8 +815,7 @@ class FreeRun(Run):
         if len(rows):
             row, pair = int(rows[0]), int(pairs[0])
             return pair, float(level[row, pair]), *times[row : row + 2].tolist()
-        # Otherwise the first pair that comes into range with an overlap at the end. Out of range a
-        # gap has no meaning and may be negative.
+        # Otherwise the first pair that enters its range and overlaps; gaps out of range are void.
         enters = (ranges[1:] > 0) & (ranges[:-1] <= 0) & self.monitored
         enters &= (gaps[1:] < -CLOSED_GAP * unit) & (gaps[1:] > -MAX_STEP * unit)
         enters[:, excluded] = False

@@ -71,7 +71,6 @@ _OUTCOMES = {
     ViolationKind.HELD: OutcomeKind.HELD,
 }
 
-
 _STAGES = np.array([0.0, *(STAGE_TIMES[stage] for stage in INNER_STAGES), 1.0])[:, None]
 _POWERS, _CHEBYSHEV = np.arange(len(_STAGES)), (1 - np.cos(np.pi * np.arange(17) / 16)) / 2
 _INTERPOLATION = _CHEBYSHEV[:, None] ** _POWERS @ np.linalg.inv(_STAGES**_POWERS)

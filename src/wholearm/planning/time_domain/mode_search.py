@@ -28,7 +28,6 @@ MIN_INTERVALS = 3  # fewest intervals of a stage
 MIN_GAIN = 1e-4  # least relative gain of a neighbour; a vanished stage is dropped at this loss
 MAX_ITER = 50  # most solver iterations for a neighbour
 
-
 Mode = tuple[float, ...]
 """Contact mode of a stage: signs of the rates of (contacts, joints); zero for rolling contacts."""
 
