@@ -738,12 +738,12 @@ class PassageTuner:
             losses += [(loss.time, loss.contact) for loss in opened]
         losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
-        at = int(np.searchsorted(simulation.t, time))
-        t, c_n, gaps = (part[: at + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
+        k = int(np.searchsorted(simulation.t, time))
+        t, c_n, gaps = (part[: k + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
         # The step of the simulation may extend beyond the arrival of a coordinate.
-        if t[at] > time:
-            sample, t[at] = simulation.trajectory.at([time]), time
-            gaps[at], c_n[at] = self.measure(sample.z)[0], sample.c_n[0]
+        if t[k] > time:
+            sample, t[k] = simulation.trajectory.at([time]), time
+            gaps[k], c_n[k] = self.measure(sample.z)[0], sample.c_n[0]
         distance = float(gaps[t >= start].min(initial=math.inf))
         least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
         if losses:
@@ -753,9 +753,9 @@ class PassageTuner:
         elif arrival == stop:
             outcome = TrialOutcome.ARRIVES
         else:
-            stopped = turn_time == stop or not simulation.z_dot[at].any()
-            outcome = TrialOutcome.RESTS if stopped else TrialOutcome.LASTS
-        z, v, z_ddot = (part[[at]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
+            is_stopped = turn_time == stop or not simulation.z_dot[k].any()
+            outcome = TrialOutcome.RESTS if is_stopped else TrialOutcome.LASTS
+        z, v, z_ddot = (part[[k]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
         if not self.gains_contact and time > 0:
             z, v, z_ddot = simulation.trajectory.at([time])[:3]
         _, (gradient,), (curvature,) = self.end.evaluate(z, v)

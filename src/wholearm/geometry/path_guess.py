@@ -62,7 +62,7 @@ def multistart(formation: Formation, z: Array, slip: Array, ends: list[Ending]) 
         return None
     metric = metric_weights(formation.scene)
     places = _list_places(formation, z)
-    nearest, least = None, np.inf
+    nearest, min_distance = None, np.inf
     for end in ends:
         for k in np.argsort(end.measure(places))[:24]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
@@ -70,8 +70,8 @@ def multistart(formation: Formation, z: Array, slip: Array, ends: list[Ending]) 
                 continue
             distance = float(np.sqrt(metric @ (goal - z) ** 2))
             # Ends at the start do not count.
-            if MIN_DISTANCE * formation.scene.scales.length < distance < least:
-                nearest, least = goal, distance
+            if MIN_DISTANCE * formation.scene.scales.length < distance < min_distance:
+                nearest, min_distance = goal, distance
     return nearest
 
 
@@ -105,7 +105,7 @@ class PathGuess:
     z: Array  # (n, 5): with all contacts closed, evenly spread
     directions: Directions
     # rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses
-    turns: tuple[int, ...] = ()
+    reversals: tuple[int, ...] = ()
 
     @property
     def length(self) -> float:
@@ -132,8 +132,8 @@ def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[Pat
         signs = [np.append(part.Xi, part.sigma) for part in parts]
         for part, sign, next_sign in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
             places = curve.evaluate(np.linspace(part.start, min(part.stop, stop), N_POINTS)).z
-            turns = tuple(np.flatnonzero(sign != next_sign).tolist())
-            guesses.append(PathGuess(formation, places, Directions(part.Xi, part.sigma), turns))
+            reversals = tuple(np.flatnonzero(sign != next_sign).tolist())
+            guesses.append(PathGuess(formation, places, Directions(part.Xi, part.sigma), reversals))
         return guesses
     return [connect(formation, z, _find_goal(phase, z, later))]
 

@@ -87,8 +87,8 @@ def runs_on_curve(phase: Phase) -> bool:
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
     """Blocks of phases that are planned together: joined smoothly or by impacts."""
-    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
-    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
+    block_ends = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
+    return [problem.phases[start:stop] for start, stop in pairwise([0, *block_ends])]
 
 
 def runs_on_curves(block: Sequence[Phase]) -> bool:
@@ -300,9 +300,9 @@ def find_crossing(
 
 def _refine_dips(grid: Array, values: Array) -> Array:
     """Samples around minima that may be negative, bounded by half the second difference."""
-    before, middle, after = values[:-2], values[1:-1], values[2:]
-    dips = (middle <= before) & (middle <= after) & (middle > LIMIT_ERROR)
-    rows = np.flatnonzero((dips & (middle < before - 2 * middle + after)).any(axis=1))
+    left, middle, right = values[:-2], values[1:-1], values[2:]
+    dips = (middle <= left) & (middle <= right) & (middle > LIMIT_ERROR)
+    rows = np.flatnonzero((dips & (middle < left - 2 * middle + right)).any(axis=1))
     if not len(rows):
         return rows.astype(float)
     fractions = np.linspace(0.0, 1.0, 14)[1:-1]

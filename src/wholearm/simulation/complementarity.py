@@ -323,7 +323,7 @@ class ClosedContacts:
         count, sticking, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()
         sigma[self.joints] = solution.sign[len(self.static) :]
         rows, owners = np.vstack([A_t, np.eye(system.n)]), [*self.static, *(count + self.joints)]
-        # Of contacts that stick together, such as a flush edge's, the most loaded one comes first.
+        # Of contacts that stick together, such as a flush edge's, the largest ratio comes first.
         # Case: the least-time policy of the square, where mode selection does not end otherwise.
         for j in np.argsort(-solution.ratios, kind="stable").tolist():
             row, sign = int(owners[j]), solution.sign[j]
@@ -372,11 +372,11 @@ class FreeRun(Run):
         for _ in range(5):
             # Project onto the closed contacts, in the metric M.
             gaps, ranges = system.measure_at(self.z)
-            near = np.flatnonzero((np.abs(gaps) < max_gap) & (ranges > -max_gap)).tolist()
-            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
+            pairs = np.flatnonzero((np.abs(gaps) < max_gap) & (ranges > -max_gap)).tolist()
+            if np.abs(gaps[pairs]).max(initial=0.0) < 1e-15 * system.scales.length:
                 break
-            rows = system.evaluate(self.z, self.v, near).A / root_mass
-            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root_mass
+            rows = system.evaluate(self.z, self.v, pairs).A / root_mass
+            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[pairs], rcond=1e-9)[0] / root_mass
         while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
             if self.t >= self.stop:
                 self.next_piece()
@@ -594,10 +594,10 @@ class FreeRun(Run):
         if at_rest and self.resting:
             # Another distribution of forces at rest is no event.
             return
-        system, before = self.system, self.modes
+        system, previous = self.system, self.modes
         names = system.names
-        lost = [pair for pair in before.kept if pair not in modes.kept]
-        gained = [pair for pair in modes.kept if pair not in before.kept]
+        lost = [pair for pair in previous.kept if pair not in modes.kept]
+        gained = [pair for pair in modes.kept if pair not in previous.kept]
         tolerance = CLOSED_GAP * system.scales.length
         for pair in lost:
             gaps, ranges = system.measure_at(self.z)
@@ -612,14 +612,14 @@ class FreeRun(Run):
         for pair in gained if self.records else ():
             self.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
         if not self.records:
-            before = modes
-        old_signs = dict(zip(before.kept, before.Xi, strict=True))
+            previous = modes
+        old_signs = dict(zip(previous.kept, previous.Xi, strict=True))
         changes = [
             (names[pair], old_signs[pair], Xi, "slides")
             for pair, Xi in zip(modes.kept, modes.Xi, strict=True)
             if pair in old_signs and system.friction[pair] > 0
         ]
-        joints = zip(before.sigma, modes.sigma, strict=True)
+        joints = zip(previous.sigma, modes.sigma, strict=True)
         changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
         for name, old, now, verb in changes:
             if old != now:
@@ -712,10 +712,10 @@ class FreeRun(Run):
         self.closing_gaps = np.where(gaps > -MAX_OVERLAP * self.unit, levels, -np.inf)
         # Values may start below zero, as modes are selected a short time later.
         self.shift = np.maximum(self.slack, self.slack - self.values)
-        near = self.monitored & (gaps <= MIN_GAP * self.unit) & (gaps > -CLOSED_GAP * self.unit)
-        if near.any():
+        is_near = self.monitored & (gaps <= MIN_GAP * self.unit) & (gaps > -CLOSED_GAP * self.unit)
+        if is_near.any():
             # Half the time after which a pair that has just opened closes; slower ones are closed.
-            rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
+            rows = self.system.evaluate(self.z, self.v, is_near.nonzero()[0].tolist())
             rate, growth = rows.A @ self.v, rows.A @ self.s.outputs.acceleration + rows.A_dot_v
             closing = (rate >= self.chatter_speed) & (growth < 0)
             self.h = float((-rate[closing] / growth[closing]).min(initial=self.h))

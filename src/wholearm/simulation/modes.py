@@ -88,7 +88,7 @@ class Mode:
         return self.formation.n_contacts + len(self.holders)
 
     @property
-    def held(self) -> list[int]:
+    def first_rows(self) -> list[int]:
         """First row of each contact, flush edge or joint that rolls, sticks or is held."""
         return [rows[0] for rows in self.holders]
 
@@ -106,10 +106,10 @@ class Mode:
 
 def find_mode(formation: Formation, signs: Array) -> Mode:
     """Mode with sticking where `signs`, (n_c + 2,), are zero; with one freedom none sticks."""
-    held: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
+    holders: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
     if formation.n_constraints < 4:
-        held += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
-    return Mode(formation, signs, tuple(sorted(held)))
+        holders += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
+    return Mode(formation, signs, tuple(sorted(holders)))
 
 
 def list_modes(
@@ -187,9 +187,9 @@ class Response(NamedTuple):
 
 def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
     """Solve the equations of motion at velocity v, (5,); None for dependent constraints."""
-    scene, count, held = mode.formation.scene, mode.formation.n_contacts, mode.held
+    scene, count, first_rows = mode.formation.scene, mode.formation.n_contacts, mode.first_rows
     slip_rows = (mode.formation.sliding_friction * mode.signs[:count])[:, None] * rows.A_t[:count]
-    P, G = (np.vstack([part, rows.A_t[held]]) for part in (rows.A, rows.A - slip_rows))
+    P, G = (np.vstack([part, rows.A_t[first_rows]]) for part in (rows.A, rows.A - slip_rows))
     inverse_mass = 1 / scene.mass_diagonal
     if mode.n_constraints > mode.formation.n_constraints:
         unit_rows = P * np.sqrt(inverse_mass)
@@ -206,7 +206,7 @@ def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
     c = np.zeros((len(P), 3))
     if abs(ratio) > 1e-12:
         rhs = -PM @ applied
-        rhs[:, 0] -= np.append(rows.A_dot_v, rows.A_t_dot_v[held])
+        rhs[:, 0] -= np.append(rows.A_dot_v, rows.A_t_dot_v[first_rows])
         c = np.asarray(np.linalg.solve(K, rhs), dtype=float)
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = rows.A_t @ acceleration
@@ -217,7 +217,7 @@ def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
 def find_fixed(mode: Mode, rows: ContactRows) -> Flags:
     """Whether a mode fixes each contact, then joint, (n_c + 2,)."""
     root_mass = np.sqrt(mode.formation.scene.mass_diagonal)
-    P, A_t = np.vstack([rows.A, rows.A_t[mode.held]]) / root_mass, rows.A_t / root_mass
+    P, A_t = np.vstack([rows.A, rows.A_t[mode.first_rows]]) / root_mass, rows.A_t / root_mass
     length = np.linalg.norm(A_t, axis=1)
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     return np.asarray(np.linalg.norm(A_t - (A_t @ basis.T) @ basis, axis=1) < 1e-7 * length)

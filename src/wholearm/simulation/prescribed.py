@@ -199,16 +199,16 @@ class Replay(Run):
         phase; speed along the heading, in the metric M5. The last value is 1 with several degrees
         of freedom, as contacts and joints then come to rest one by one.
         """
-        out, ends, scales = self.s.outputs, self.ends, self.system.scales
-        ends.state[:] = out.y[:10]
+        outputs, ends, scales = self.s.outputs, self.ends, self.system.scales
+        ends.state[:] = outputs.y[:10]
         ends.evaluate()
         self.distance, self.rate = ends.values[-2:].tolist()
         speed = 1.0
         if self.mode.n_constraints >= 4:
-            size = float(self.heading @ (self.system.mass * out.y[5:10]))
+            size = float(self.heading @ (self.system.mass * outputs.y[5:10]))
             speed = size / (scales.speed * scales.mass**0.5)
         # Values of the object's coordinates, between these, are zero.
-        contacts, joints = out.values[: self.s.rows.slide.stop], out.values[-2:]
+        contacts, joints = outputs.values[: self.s.rows.slide.stop], outputs.values[-2:]
         end_values = self.distance / ends.unit, speed
         return np.concatenate([contacts, joints, ends.values[:-2] / scales.length, end_values])
 
@@ -586,8 +586,8 @@ class Replay(Run):
     def _ends_by_impact(self) -> bool:
         """Whether the phase ends with an impact, at a speed above the errors of rest."""
         rate, time = -self._measure_rate(), self._time_to_stop() / self.problem.scene.scales.time
-        soft = rate < REST_SPEED or rate * time / 2 < ARRIVAL
-        return self.phase.end is End.IMPACT and not soft
+        is_soft = rate < REST_SPEED or rate * time / 2 < ARRIVAL
+        return self.phase.end is End.IMPACT and not is_soft
 
     def enter(self, phase: Phase, next_phase: Phase | None) -> None:
         """Enter the formation of `phase`; energy lost by the projection counts as impact loss.
@@ -640,11 +640,11 @@ class Replay(Run):
         """Plastic impact onto the next formation; returns the outcome if infeasible."""
         z = self._close(next_phase.formation)
         impact = compute_impact(self.formation, next_phase.formation, z, self.v)
-        name, least = impact.least_impulse
+        name, min_impulse = impact.least_impulse
         names = next_phase.formation.names
         normal = impact.p[: len(names)]
         impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
-        self.note(EventKind.IMPACT, "impact", name, least, f", in N s {impulses}")
+        self.note(EventKind.IMPACT, "impact", name, min_impulse, f", in N s {impulses}")
         if impact.violations:
             worst = impact.violations[0]
             text = f"{worst.describe()} in the impact {self.when()}"
@@ -865,12 +865,12 @@ class Replay(Run):
         rates = self.values[self.rate_rows][self.signs != 0]
         return bool((rates > 10 * span / time * (max_acceleration + max_speed**2)).all())
 
-    def note_change(self, row: int, before: float, after: float) -> None:
+    def note_change(self, row: int, old_sign: float, new_sign: float) -> None:
         """Record that a contact or joint sticks, slips or reverses."""
         names = self.formation.names
         contact = row < len(names)
         name = names[row] if contact else f"joint {row - len(names) + 1}"
-        kind, text = describe_change(name, before, after, "slides" if contact else "turns")
+        kind, text = describe_change(name, old_sign, new_sign, "slides" if contact else "turns")
         self.note(kind, text, name)
 
     def _choose(self, signs: Array, units: Sequence[modes.Unit]) -> modes.Mode:

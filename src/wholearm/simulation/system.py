@@ -453,15 +453,15 @@ def _build_motion(
     r = ca.vertcat(gap, ca.vertcat(slip, z)[first_rows] - x.anchors)
     constraints = ca.Function("rows", [z, x.anchors, x.geometry], [ca.densify(P), ca.densify(r)])
 
-    def project(at: Inputs, state: Expression) -> Expression:
+    def project(data: Inputs, state: Expression) -> Expression:
         if not P.shape[0]:
             return state
         # A step leaves gaps of the size of its error, so one Newton iteration closes them.
         correct, speed = _build_correction(*P.shape), state[n:]
-        rows, r = constraints(state[:n], at.anchors, at.geometry)
-        place = state[:n] - correct(rows, r, at.inverse_mass)
-        rows, _ = constraints(place, at.anchors, at.geometry)
-        return ca.vertcat(place, speed - correct(rows, rows @ speed, at.inverse_mass))
+        rows, r = constraints(state[:n], data.anchors, data.geometry)
+        place = state[:n] - correct(rows, r, data.inverse_mass)
+        rows, _ = constraints(place, data.anchors, data.geometry)
+        return ca.vertcat(place, speed - correct(rows, rows @ speed, data.inverse_mass))
 
     return stage, report, project
 

@@ -744,8 +744,8 @@ def _reverse_first(path: PathGuess, previous: PathGuess) -> list[PathGuess]:
     them `heptagon.toml` takes half as long again to plan, with a smaller margin.
     """
     # Rolling contacts have no direction to keep.
-    slides = np.delete(np.arange(previous.formation.n_contacts), previous.formation.rolling_rows)
-    directions = {previous.formation.names[k]: previous.directions.Xi[k] for k in slides}
+    sliding = np.delete(np.arange(previous.formation.n_contacts), previous.formation.rolling_rows)
+    directions = {previous.formation.names[k]: previous.directions.Xi[k] for k in sliding}
     path_signs, formation = np.concatenate(path.directions), path.formation
     n_c = formation.n_contacts
     signs = path_signs.copy()
@@ -759,7 +759,7 @@ def _reverse_first(path: PathGuess, previous: PathGuess) -> list[PathGuess]:
     pieces = []
     cuts = np.linspace(0, len(path.z) - 1, len(reversals) + 2).astype(int)
     for k, (begin, stop) in enumerate(pairwise(cuts)):
-        rows = reversals[k] if k < len(reversals) else path.turns
+        rows = reversals[k] if k < len(reversals) else path.reversals
         pieces.append(_make_piece(formation, path.z[begin : stop + 1], signs, rows))
         if k < len(reversals):
             signs[list(reversals[k])] = path_signs[list(reversals[k])]

@@ -947,8 +947,8 @@ def brake_kernel(formation: Formation) -> Kernel:
     x = Columns(z=5, a=5).make_symbols()
     p = Columns(Xi=formation.n_contacts, sigma=2).make_symbols()
     A_t = formation.function(x.z, ca.SX.zeros(5))[2]
-    slides = (p.Xi * (A_t @ x.a))[list(formation.rubbing_rows), :]
-    return build_kernel(x, p, brake=-ca.vertcat(slides, p.sigma * x.a[3:]))
+    decelerations = (p.Xi * (A_t @ x.a))[list(formation.rubbing_rows), :]
+    return build_kernel(x, p, brake=-ca.vertcat(decelerations, p.sigma * x.a[3:]))
 
 
 @cached_kernel
