@@ -32,7 +32,7 @@ from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
 from wholearm.common.document import Document, Table
 from wholearm.common.parallel import Journal, Processes, run_all
-from wholearm.planning.nlp import open_ledger
+from wholearm.planning.nlp import collect_costs
 from wholearm.problem.read import build_problem, read_problem
 
 
@@ -207,12 +207,12 @@ def test_work_is_as_large_as_is_asked() -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
     # Five nodes for each element of four intervals, of which there are more than switches.
     for size, nodes in ((40, 50), (80, 100)):
-        with open_ledger() as ledger:
+        with collect_costs() as ledger:
             run_work(table, "intervals", "least time", size)
         assert ledger.runs[0].unknowns == 3 * nodes - 2
-    with open_ledger() as ledger:
+    with collect_costs() as ledger:
         # Another ledger with the same runs, none, ends before.
-        with open_ledger() as other:
+        with collect_costs() as other:
             pass
         run_work(table, "intervals", "margin", 40)
     assert max(run.unknowns for run in ledger.runs) > 3 * 50 - 2 and not other.runs

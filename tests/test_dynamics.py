@@ -426,9 +426,9 @@ def draw(rng: np.random.Generator, mu: float) -> complementarity.ContactProblem:
     return complementarity.ContactProblem(lift, A, G, b_n, T, b_t, np.array([0, 1, -1]), *bounds)
 
 
-def check(p: complementarity.ContactProblem, answer: complementarity.ContactAnswer) -> None:
+def check(p: complementarity.ContactProblem, answer: complementarity.ContactSolution) -> None:
     """Coulomb's law and complementarity, from the forces alone."""
-    change = p.lift * (p.G.T @ answer.c_n + p.T.T @ answer.f)
+    change = p.inverse_mass * (p.G.T @ answer.c_n + p.T.T @ answer.f)
     r_n, r_t = p.b_n + p.A @ change, p.b_t + p.T @ change
     assert answer.c_n.min() >= 0 and r_n.min() > -1e-9
     assert answer.c_n * r_n == pytest.approx(np.zeros(3), abs=1e-8)
@@ -442,12 +442,12 @@ def test_lemke_finds_one_of_all_answers() -> None:
     rng = np.random.default_rng(5)
     for _ in range(40):
         problem = draw(rng, 0.15)
-        found, every = complementarity.solve_problem(problem), complementarity.list_answers(problem)
-        assert found is not None and every
-        check(problem, found)
+        one, every = complementarity.solve_problem(problem), complementarity.list_solutions(problem)
+        assert one is not None and every
+        check(problem, one)
         for answer in every:
             check(problem, answer)
-        assert min(np.abs(found.change - a.change).max() for a in every) < 1e-8
+        assert min(np.abs(one.change - a.change).max() for a in every) < 1e-8
 
 
 def count_answers(K: Array, loads: Array) -> Array:

@@ -79,7 +79,7 @@ def test_pairs_are_the_contacts_that_problems_name(name: str) -> None:
         assert system.measure(z[None])[0][0, pair] == pytest.approx(known.C[0, 0], abs=1e-13)
         assert rows.A == pytest.approx(known.A[0], abs=1e-12)
         assert rows.A_t == pytest.approx(known.A_t[0], abs=1e-12)
-        assert rows.bend == pytest.approx(known.P_dot_v[0], abs=1e-9)
+        assert rows.A_dot_v == pytest.approx(known.P_dot_v[0], abs=1e-9)
 
 
 def pinch(torque: float, until: float = 10.0) -> tuple[Problem, TorqueProfile, Array]:

@@ -22,7 +22,7 @@ from scenes import box, constant, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, box_text, problem_of, text_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.analysis import slow_speeds
-from wholearm.analysis.tuning import FACTOR, TrialOutcome, split_passages
+from wholearm.analysis.tuning import RATIO, TrialOutcome, split_passages
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.figures import plots
@@ -254,12 +254,12 @@ def test_torques_are_quasistatic_ones_in_steps_of_ten_percent() -> None:
     phase = tune_box().phases[0]
     assert phase.acting == 1, "the right finger pushes a slide to the left"
     for step in phase.steps[:2]:
-        powers = np.log(np.array(step.tau) / phase.quasistatic) / np.log(FACTOR)
+        powers = np.log(np.array(step.tau) / phase.quasistatic) / np.log(RATIO)
         assert powers == pytest.approx(np.round(powers), abs=1e-9)
     assert phase.steps[0].tau[0] > phase.quasistatic[0] > phase.steps[1].tau[0]
     drives = [trial for trial in phase.trials if len(trial.steps) == 1]
     raised = [trial.steps[0].tau[0] for trial in drives]
-    assert np.array(raised[1:]) == pytest.approx(FACTOR * np.array(raised[:-1]))
+    assert np.array(raised[1:]) == pytest.approx(RATIO * np.array(raised[:-1]))
     slides = [trial for trial in drives if trial.outcome is TrialOutcome.ARRIVES]
     times = [trial.time for trial in slides]
     assert times == sorted(times, reverse=True), "more torque brings it there sooner"

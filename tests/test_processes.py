@@ -33,7 +33,7 @@ from wholearm.common import files as archive
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
 from wholearm.common.parallel import Processes, can_fork, count_cores, run_all, run_tasks
-from wholearm.planning.nlp import STOPPED, Solver
+from wholearm.planning.nlp import INTERRUPTED, Solver
 from wholearm.simulation.simulate import simulate
 
 PARENT = os.getpid()
@@ -388,7 +388,7 @@ def test_workers_end_with_their_command(then: str, tmp_path: Path) -> None:
 
 
 def test_a_solver_that_an_interrupt_stops_raises_it() -> None:
-    stats = {"success": False, "return_status": STOPPED}
+    stats = {"success": False, "return_status": INTERRUPTED}
     with pytest.raises(KeyboardInterrupt):
         Solver(Mock(return_value={"x": 1.0}, stats=lambda: stats))(x0=0.0)
 

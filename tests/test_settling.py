@@ -33,7 +33,7 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.modes import DRIVE, Rest, find_standstill, maximise_margin, require_closed
+from wholearm.simulation.modes import A_MIN, Rest, find_standstill, maximise_margin, require_closed
 from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
@@ -133,7 +133,7 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         assert one.heading is not None and two.heading is not None
         way = one if normal @ one.heading < 0 else two
         closing = -float(normal @ way.heading) * way.drive(tau)
-        assert closing >= 0.99 * DRIVE * problem.scene.scales.acceleration
+        assert closing >= 0.99 * A_MIN * problem.scene.scales.acceleration
         assert settling.speed == pytest.approx(np.sqrt(2 * gap * closing), rel=0.02)
         assert not balances(phase.formation, z, tau)
 

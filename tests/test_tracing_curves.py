@@ -20,7 +20,7 @@ from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import POINTS, PathGuess, guess_phase
+from wholearm.geometry.path_guess import N_POINTS, PathGuess, guess_phase
 from wholearm.geometry.tracing import EndDistance, trace_curve, trace_phase, trace_phases
 from wholearm.mechanics.dynamics import close_contacts, metric_weights
 from wholearm.planning.time_domain.time_plan import plan_phases
@@ -366,7 +366,7 @@ def test_outlines_are_closed_at_every_point_and_end_where_their_phase_does(
 ) -> None:
     for phase, parts in zip(flipping.phases, outlines, strict=True):
         for part in parts:
-            assert len(part.z) == POINTS
+            assert len(part.z) == N_POINTS
             assert np.abs(plane.measure_gaps(part.formation, part.z)).max() < CLOSED
             assert part.formation.evaluate_limits(part.z).min() > -CLOSED
         if not phase.until.is_release:

@@ -21,7 +21,7 @@ from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint, border, describe_pose, directions_of, solve_tangent
-from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
+from ..geometry.path_guess import RELEASE_PLACE, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
     LAMBDA,
@@ -320,7 +320,7 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
     if formation.n_constraints == 4 and count_freedoms(formation, z) == 1:
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
-            curve = replace(curve, length=RELEASE_AT * curve.length)
+            curve = replace(curve, length=RELEASE_PLACE * curve.length)
         # Both ends of each segment, and denser there, where motions start and stop.
         sizes = [part.stop - part.start for part in curve.segments]
         counts = [max(5, round(N_PLACES * size / curve.length)) for size in sizes]

@@ -31,34 +31,34 @@ from ..simulation.system import REST_WINDOW
 from ..verification import free
 from .slow_speeds import SQUEEZE, PathSamples, find_torques, sample_path
 
-FACTOR = 1.1
-"""Factor that raises a torque by 10 %; lowering divides by it, so that values repeat."""
+RATIO = 1.1
+"""Ratio of successive torques: raised by multiplication, lowered by division."""
 
 
 @dataclass(frozen=True)
 class TuningSettings:
-    """Accuracies and limits of the search; times and speeds are over those of the scene."""
+    """Accuracies and limits of the search; times and speeds are relative to the scene's."""
 
     trial_time: float = 40.0  # duration of a trial after its last step of the torques
     pause: float = 0.2  # time for which the object is held at the end of each phase
-    back: float = 1e-6  # increase of the distance, over the path, that counts as turning back
-    # Largest speed of arrival with a brake: impacts then open contacts for a negligible time.
+    turn_back: float = 1e-6  # increase of the distance, over the path, that counts as turning back
+    # Largest arrival speed with a brake; contacts open in the impact for a negligible time.
     slow: float = 3e-5
-    coarse: float = 50.0  # factor on that speed while brakes are compared
+    coarse: float = 50.0  # factor on that speed during the comparison of brakes
     raises: int = 60  # largest number of raises or lowerings of a torque: a factor of 300
     brake_step: int = 2  # steps by which the acting torque is lowered while it brakes too little
-    gain: float = 0.02  # least relative reduction of the duration by another step of the brake
+    min_gain: float = 0.02  # least relative reduction of the duration by another step of the brake
     failures: int = 2  # failed torques after a successful one with which the search ends
     max_trials: int = 24  # most trials in the search for the instant of the brake
-    max_losses: int = 4  # most of them that may lose a contact
-    # Bracket of that instant, over its time, below which the search ends if the arrival is fast
-    # (over the drive's speed) or the distance large (over the path): the instant has no effect.
+    max_losses: int = 4  # most of these trials that may lose a contact
+    # The search ends below the relative bracket of the instant if the arrival speed, over the
+    # drive's, and the distance, over the path, are both larger than these: a discontinuity.
     bracket: float = 1e-3
-    fast: float = 0.1
-    far: float = 0.02
+    speed: float = 0.1
+    gap: float = 0.02
     n_grid: int = 16  # instants of the brake on a grid, if the object arrives with all of them
-    n_sections: int = 45  # most steps of golden-section search for the slowest arrival
-    holds: int = 6  # lowerings of the acting torque to hold the end, plus one
+    max_sections: int = 45  # most steps of golden-section search for the slowest arrival
+    max_holds: int = 6  # one more than the lowerings of the acting torque that holds the end
     max_simulations: int = 600  # largest number for one start
     max_stops: int = 7  # most stops of a phase: three bisections
 
@@ -117,7 +117,7 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
 
 
 class Passage(NamedTuple):
-    """Phases that pass into one another in motion."""
+    """Successive phases without a stop between them."""
 
     phases: tuple[Phase, ...]
     following: Phase | None  # the next phase; None after the last
@@ -140,7 +140,7 @@ def split_passages(problem: Problem) -> list[Passage]:
 
 @dataclass(frozen=True, eq=False)
 class PhaseTuning:
-    """Tuning of a passage: one phase, or several that pass into one another in motion."""
+    """Tuning of a passage: one phase, or several without a stop between them."""
 
     number: int  # number, last: of the first and the last phase
     last: int
@@ -166,7 +166,7 @@ class PhaseTuning:
 
     @property
     def title(self) -> str:
-        """Numbers of the phases, such as 3 or 9-11."""
+        """Phase numbers, such as 3 or 9-11."""
         return f"{self.number}" if self.number == self.last else f"{self.number}-{self.last}"
 
 
@@ -253,7 +253,7 @@ def tune(
 
     Each phase has constant torques. The acting torque, with the largest work, is raised until the
     object slides to the end of the phase, and further for speed until a contact is lost; then it
-    is lowered by 10 %. Phases that pass into one another in motion are tuned as one.
+    is lowered by 10 %. Phases without a stop between them are tuned as one.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def tune(
     z, time = problem.start, 0.0
     with name_source(problem.source):
         for passage in split_passages(problem):
-            tunings += (parts := _carry(problem, passage, options, z, stops))
+            tunings += (parts := _tune_passage(problem, passage, options, z, stops))
             for part in parts:
                 if part.end is None:
                     reason = f"phase{'s' if '-' in part.title else ''} {part.title}: {part.reason}"
@@ -290,7 +290,7 @@ def tune(
     return Tuning(problem.name, tuple(tunings), rows, report, report.reason)
 
 
-def _carry(
+def _tune_passage(
     problem: Problem, passage: Passage, options: TuningOptions, z: Array, stops: int
 ) -> list[PhaseTuning]:
     """Tune a passage from rest at `z`; if that fails, in halves with up to `stops` stops."""
@@ -299,11 +299,11 @@ def _carry(
     halves = tuner.halve() if tuning.end is None and stops else None
     if halves is None:
         return [tuning]
-    first = _carry(problem, halves[0], options, z, (stops - 1) // 2)
+    first = _tune_passage(problem, halves[0], options, z, (stops - 1) // 2)
     first[0] = replace(first[0], simulations=first[0].simulations + tuning.simulations)
     if first[-1].end is None:
         return first
-    return [*first, *_carry(problem, halves[1], options, first[-1].end, stops - len(first))]
+    return [*first, *_tune_passage(problem, halves[1], options, first[-1].end, stops - len(first))]
 
 
 class TuningOptions(NamedTuple):
@@ -380,8 +380,8 @@ class PassageTuner:
         best, (balanced, self.acting) = None, balance
         self.last, count = balanced[-1], len(self.problem.phases)
         self.title = f"phase {tuning.title} of {count}, finger {self.acting + 1}"
-        # The supporting torque at the start, then the one that presses most: the right finger
-        # presses anticlockwise, the left one clockwise.
+        # The supporting torque at the start, then the largest one towards the object: anticlockwise
+        # of the right finger, clockwise of the left one.
         supporting, extreme = balanced[:, 1 - self.acting], np.max if self.acting else np.min
         for support in dict.fromkeys([supporting[0], extreme(supporting)]):
             self.tau = np.where(np.arange(2) == self.acting, balanced[0], support)
@@ -395,9 +395,9 @@ class PassageTuner:
         assert best is not None
         return best
 
-    def _attempt(self, new: PhaseTuning) -> PhaseTuning:
+    def _attempt(self, phase: PhaseTuning) -> PhaseTuning:
         """Tune the passage from the present torques."""
-        new, drives = replace(new, quasistatic=self.scale(0)), self.drive()
+        phase, drives = replace(phase, quasistatic=self.scale(0)), self.drive()
         drives = drives[: 1 + round(self.options.share * (len(drives) - 1))]
         if not drives:
             nearest, last = min(self.trials, key=lambda trial: trial.short), self.trials[-1]
@@ -406,12 +406,12 @@ class PassageTuner:
             limit = "up to the torque limit"
             if last.outcome is TrialOutcome.LOSES:
                 limit = f"and raised {len(self.trials) - 1} times it {last.to_text()}"
-            return self._sum_up(new, last, reason=f"{text}, {limit}")
+            return self._summarize(phase, last, reason=f"{text}, {limit}")
         if not self.options.brake:
-            # The fastest drive after which the object is held; slow ones arrive most gently.
+            # The fastest drive after which the object is held; slower ones arrive at lower speed.
             solution = None
             for drive in drives:
-                attempt = self._hold(replace(new, raised=drive.raised), drive.trial)
+                attempt = self._hold(replace(phase, raised=drive.raised), drive.trial)
                 if attempt.end is None:
                     return solution or attempt
                 solution = attempt
@@ -421,22 +421,22 @@ class PassageTuner:
         if braked is None:
             text = "no torque in steps of 10 % brings it to rest at its end: a trial "
             text += self.trials[-1].to_text()
-            return self._sum_up(new, drives[-1].trial, raised=drives[-1].raised, reason=text)
+            return self._summarize(phase, drives[-1].trial, raised=drives[-1].raised, reason=text)
         drive, brake = braked
-        new = replace(new, raised=drive.raised, braked=brake.raised, supported=brake.supported)
-        return self._hold(new, brake.trial)
+        phase = replace(phase, raised=drive.raised, braked=brake.raised, supported=brake.supported)
+        return self._hold(phase, brake.trial)
 
-    def _hold(self, new: PhaseTuning, trial: TuningTrial) -> PhaseTuning:
+    def _hold(self, phase: PhaseTuning, trial: TuningTrial) -> PhaseTuning:
         """Tuning with torques that hold the object at the arrival of a trial."""
         rate = f"{trial.rate:.3g} {self.end.unit}/s at t = {trial.time:.5g} s"
         for tau in self._list_holds(trial):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
             z, text = self.land(steps, trial.time, trial.time + SETTINGS.pause * self.time)
-            new = self._sum_up(new, trial, steps=steps, end=None if text else z)
+            phase = self._summarize(phase, trial, steps=steps, end=None if text else z)
             if not text:
                 break
-            new = replace(new, reason=f"{self.until} is reached at {rate}, and {text}")
-        return new
+            phase = replace(phase, reason=f"{self.until} is reached at {rate}, and {text}")
+        return phase
 
     def _list_holds(self, trial: TuningTrial) -> list[tuple[float, float] | None]:
         """Torques that may hold the object; None for those of the arrival.
@@ -450,18 +450,18 @@ class PassageTuner:
         if balance is None:
             return [None]
         (first, second), acting = balance[0][0].tolist(), balance[1]
-        factors = [FACTOR**n for n in range(1, SETTINGS.holds)]
+        factors = [RATIO**n for n in range(1, SETTINGS.max_holds)]
         lowered = [(first / f, second) if acting == 0 else (first, second / f) for f in factors]
         tau, last = np.array(trial.steps[-1].tau), []
         if following is None:
-            tau[1 - acting] /= FACTOR**SETTINGS.holds
-            last = [tuple((tau / FACTOR ** (SETTINGS.holds * n)).tolist()) for n in range(3)]
+            tau[1 - acting] /= RATIO**SETTINGS.max_holds
+            last = [tuple((tau / RATIO ** (SETTINGS.max_holds * n)).tolist()) for n in range(3)]
         return [None, *lowered, *last]
 
     def _balance(self, phases: Sequence[Phase], z: Array) -> tuple[Array, int] | None:
         """Torques of a quasistatic motion from `z`, (n, 2), and the index of the acting finger.
 
-        They extend over phases in which every contact is kept. The acting finger does most work.
+        They end at the first phase that loses a contact. The acting finger does most work.
         """
         tau, work = list[Array](), list[Array]()
         for path in self._follow(phases, z):
@@ -481,7 +481,7 @@ class PassageTuner:
             yield path
             z = path.point.z[-1]
 
-    def _sum_up(self, tuning: PhaseTuning, trial: TuningTrial, **values: Any) -> PhaseTuning:
+    def _summarize(self, tuning: PhaseTuning, trial: TuningTrial, **values: Any) -> PhaseTuning:
         """The tuning with the values of a trial, all trials, and the number of simulations."""
         values |= {"duration": trial.time, "rate": trial.rate, "least": trial.least}
         values |= {"weakest": trial.weakest, "trials": tuple(self.trials)}
@@ -496,7 +496,7 @@ class PassageTuner:
         """Torques [N m] by numbers of raises of the acting and the supporting one."""
         powers = [supporting, supporting]
         powers[self.acting] = acting
-        first, second = (float(tau) * FACTOR**n for tau, n in zip(self.tau, powers, strict=True))
+        first, second = (float(tau) * RATIO**n for tau, n in zip(self.tau, powers, strict=True))
         return first, second
 
     def drive(self) -> list[TuningDrive]:
@@ -519,9 +519,8 @@ class PassageTuner:
     def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, TuningDrive] | None:
         """The fastest drive that a brake stops at the end of the phase, and this brake.
 
-        The acting torque of a brake is less than that of the slowest drive and than the one that
-        balances the object at the end. If no such brake keeps all contacts, the supporting torque
-        of the end is used.
+        The acting torque of a brake is below that of the slowest drive and below the quasistatic
+        one at the end. If no such brake keeps all contacts, the end's supporting torque is used.
         """
         count = len(drives)
         chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
@@ -540,7 +539,7 @@ class PassageTuner:
     def _count_steps(self, finger: int) -> int:
         """Number of raises, negative if lowered, from a torque to that of the end."""
         ratio = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
-        return math.floor(math.log(max(ratio, FACTOR**-SETTINGS.raises)) / math.log(FACTOR))
+        return math.floor(math.log(max(ratio, RATIO**-SETTINGS.raises)) / math.log(RATIO))
 
     def _lower(self, drive: TuningTrial, first: int, supported: int) -> TuningDrive | None:
         """Brake with the earliest end, by lowering the acting torque; None if none stops there."""
@@ -555,7 +554,7 @@ class PassageTuner:
                 failed += best is not None
                 raised -= SETTINGS.brake_step
                 continue
-            if best and trial.time > (1 - SETTINGS.gain) * best.trial.time:
+            if best and trial.time > (1 - SETTINGS.min_gain) * best.trial.time:
                 break
             best = TuningDrive(raised, trial, supported)
             if trial.rate < self.slow:
@@ -599,13 +598,13 @@ class PassageTuner:
                 if losses > SETTINGS.max_losses:
                     return None
                 low, distance = instant, trial.short
-                # The distance through several phases is not known.
+                # The distance over several phases is unknown.
                 error_low = (
                     error_high if distance == math.inf else max(distance, 1e-12 * self.length)
                 )
                 error_high /= 2 if side > 0 else 1
                 side = 1
-            jumps = distance > SETTINGS.far * self.length and rate > SETTINGS.fast * drive.rate
+            jumps = distance > SETTINGS.gap * self.length and rate > SETTINGS.speed * drive.rate
             if jumps and high - low < SETTINGS.bracket * high:
                 return None
             fraction = error_low / (error_low + error_high) if count % 4 != 3 else 0.5
@@ -633,7 +632,7 @@ class PassageTuner:
         rate, best = runs[k]
         if rate > min(runs[k - 1][0], runs[k + 1][0]):
             return None
-        for count in range(SETTINGS.n_sections):
+        for count in range(SETTINGS.max_sections):
             if rate < self.slow:
                 return best
             if count == SETTINGS.n_grid and rate > 2 * SETTINGS.coarse * self.slow:
@@ -694,7 +693,7 @@ class PassageTuner:
         if len(self.passage.phases) > 1:
             return False
         gap = float(self.measure(run.z[None])[0])
-        return gap > (1 + SETTINGS.back) * self.length or (not self.gains_contact and gap <= 0)
+        return gap > (1 + SETTINGS.turn_back) * self.length or (not self.gains_contact and gap <= 0)
 
     def find_ends(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
         """End times of the phases that end [s], and the first loss of a contact before them.
@@ -729,7 +728,7 @@ class PassageTuner:
         start = starts[-1] if len(starts) == len(phases) else math.inf  # of the last phase
         # Time at which the distance from the end begins to grow again.
         nearest = np.minimum.accumulate(np.where(simulation.t >= start, gaps, math.inf))
-        receding = simulation.t[gaps - nearest > SETTINGS.back * abs(self.length)]
+        receding = simulation.t[gaps - nearest > SETTINGS.turn_back * abs(self.length)]
         turn_time = float(receding.min(initial=math.inf))
         stop = min(arrival, turn_time, float(simulation.t[-1]))
         # Times at which contacts of the phases open, also those that never press.
@@ -739,12 +738,12 @@ class PassageTuner:
             losses += [(loss.time, loss.contact) for loss in opened]
         losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
-        at = int(np.searchsorted(simulation.t, time))
-        t, c_n, gaps = (part[: at + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
+        k = int(np.searchsorted(simulation.t, time))
+        t, c_n, gaps = (part[: k + 1].copy() for part in (simulation.t, simulation.c_n, gaps))
         # The step of the simulation may extend beyond the arrival of a coordinate.
-        if t[at] > time:
-            sample, t[at] = simulation.trajectory.at([time]), time
-            gaps[at], c_n[at] = self.measure(sample.z)[0], sample.c_n[0]
+        if t[k] > time:
+            sample, t[k] = simulation.trajectory.at([time]), time
+            gaps[k], c_n[k] = self.measure(sample.z)[0], sample.c_n[0]
         distance = float(gaps[t >= start].min(initial=math.inf))
         least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
         if losses:
@@ -754,9 +753,9 @@ class PassageTuner:
         elif arrival == stop:
             outcome = TrialOutcome.ARRIVES
         else:
-            stopped = turn_time == stop or not simulation.z_dot[at].any()
-            outcome = TrialOutcome.RESTS if stopped else TrialOutcome.LASTS
-        z, v, z_ddot = (part[[at]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
+            is_stopped = turn_time == stop or not simulation.z_dot[k].any()
+            outcome = TrialOutcome.RESTS if is_stopped else TrialOutcome.LASTS
+        z, v, z_ddot = (part[[k]] for part in (simulation.z, simulation.z_dot, simulation.z_ddot))
         if not self.gains_contact and time > 0:
             z, v, z_ddot = simulation.trajectory.at([time])[:3]
         _, (gradient,), (curvature,) = self.end.evaluate(z, v)

@@ -35,13 +35,13 @@ from wholearm import Plan, Problem
 from ..common.document import Table, to_plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import check_phases, trace_phases
-from ..planning.nlp import open_ledger
+from ..planning.nlp import collect_costs
 from ..problem.read import build_problem
 from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
 from ..simulation.simulate import simulate
-from ..simulation.system import NODES
+from ..simulation.system import STAGE_TIMES
 from .queries import draw_leg, draw_query
 from .scenes import draw_case
 from .stress import BASE, OBJECTIVES, STRANGE, change_tree, damage_torques
@@ -413,8 +413,8 @@ def count(problem: Problem) -> dict[str, int]:
     Sizes are those of the first NLP of each block, such as "phase 5-6 of 6: rows".
     """
     notes = list[tuple[str, int]]()
-    with open_ledger() as ledger:
-        runs = ledger.runs
+    with collect_costs() as costs:
+        runs = costs.runs
         plan = wholearm.solve(
             problem, replay=False, progress=lambda text: notes.append((text, len(runs)))
         )
@@ -428,7 +428,7 @@ def count(problem: Problem) -> dict[str, int]:
     return counts | {
         "panels of curves": sum(len(curve.panels) for curve in trace_phases(problem)),
         "iterations": sum(run.iterations for run in runs),
-        "evaluations of the replay": len(NODES) * (replay.steps + replay.rejected),
+        "evaluations of the replay": len(STAGE_TIMES) * (replay.steps + replay.rejected),
     }
 
 

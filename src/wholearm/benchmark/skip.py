@@ -19,7 +19,7 @@ import numpy as np
 
 from ..common.document import Table
 from ..geometry.tracing import load, trace_phases
-from ..planning.nlp import open_ledger
+from ..planning.nlp import collect_costs
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..planning.time_domain.time_plan import plan_phases
@@ -126,7 +126,7 @@ def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
     Time includes planning, with options of `solve`, and drawing the plan if `draw`.
     """
     started = time.process_time()
-    with open_ledger() as ledger:
+    with collect_costs() as costs:
         if options.get("transcription") == "time":
             # Not from the plan along curves, which solves other NLPs.
             plan_phases(problem, problem.phases, problem.start, PlanOptions(**options))
@@ -136,6 +136,6 @@ def spend(problem: Problem, options: dict[str, Any], draw: bool = False) -> Row:
         from ..figures.plots import force_margins
 
         force_margins(solution).canvas.draw()
-    total, solving = time.process_time() - started, sum(run.seconds for run in ledger.runs)
-    sizes = ledger.runs[0].unknowns, ledger.runs[0].rows
+    total, solving = time.process_time() - started, sum(run.seconds for run in costs.runs)
+    sizes = costs.runs[0].unknowns, costs.runs[0].rows
     return dict(zip(COLUMNS, (*sizes, total - solving, solving), strict=True))

@@ -19,12 +19,12 @@ from ..contacts.formation import CurvePoint as CurvePoint
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, find_freedoms, metric_weights
 
-_TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
+_TOL = 1e-6  # relative error of proportional rates, and relative size of zero rates
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A stretch of a curve, as the polynomial through its nodes."""
+    """A part of a curve, as the polynomial through its nodes."""
 
     s: Array  # (n,) [m]: arc lengths of the nodes, increasing
     z: Array  # z, z_s (n, 5): configurations and unit tangents there
@@ -52,7 +52,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A stretch of a curve without a reversal."""
+    """A part of a curve without a reversal."""
 
     start: float  # start, stop [m]: arc lengths of its ends
     stop: float
@@ -68,7 +68,7 @@ class Curve:
     formation: Formation
     panels: tuple[Panel, ...]
     length: float  # [m]
-    ending: str  # what happens at the end, in words
+    ending: str  # description of the end
     reached: bool  # whether the curve ends at the requested end
     # arc length per unit of the parameter s, hence the length of its tangents
     speed_ratio: float = 1.0
@@ -94,7 +94,7 @@ class Curve:
         return z, tangent
 
     def with_speed_ratio(self, ratio: float) -> Curve:
-        """Return the same curve with a parameter that runs through it at another ratio."""
+        """Return the same curve with another `speed_ratio` of its parameter."""
         if ratio == self.speed_ratio:
             return self
         factor = self.speed_ratio / ratio
@@ -120,7 +120,7 @@ class Curve:
 
     @property
     def is_regular(self) -> bool:
-        """Whether contacts stay independent all along the curve, as segments need."""
+        """Whether contacts are independent along the whole curve, as `segments` requires."""
         try:
             return bool(self.segments)
         except np.linalg.LinAlgError:
@@ -165,10 +165,10 @@ def directions_of(curve: Curve, segment: Numbers) -> Directions:
 def solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
     """Unit null vector of P nearest to `tangent`, and the curvature orthogonal to it."""
     matrix = border(P, tangent * metric)
-    right = np.zeros((len(P), 5, 2))
-    right[:, 4, 0] = 1.0
-    right[:, :4, 1] = -P_dot_v
-    solution = np.linalg.solve(matrix, right)
+    rhs = np.zeros((len(P), 5, 2))
+    rhs[:, 4, 0] = 1.0
+    rhs[:, :4, 1] = -P_dot_v
+    solution = np.linalg.solve(matrix, rhs)
     z_s, z_ss = solution[..., 0], solution[..., 1]
     z_s = z_s / np.sqrt(z_s**2 @ metric)[:, None]
     z_ss = z_ss - ((z_ss * z_s) @ metric)[:, None] * z_s
@@ -196,21 +196,21 @@ def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
     rates = find_rates(formation, z)
     norms = np.linalg.norm(rates, axis=1)
     cross_products = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
-    tied = (cross_products < _TIED * norms * norms[row]) & (norms > _TIED) & (norms[row] > _TIED)
+    tied = (cross_products < _TOL * norms * norms[row]) & (norms > _TOL) & (norms[row] > _TOL)
     return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
 
 
 def find_vanishing(formation: Formation, z: Array) -> tuple[int, ...]:
-    """Rows of (contacts, joints) whose rates vanish at a place of a curve, whatever its speed."""
+    """Rows of (contacts, joints) whose rates vanish at a place of a curve at any speed."""
     rates = find_rates(formation, z)
-    return tuple(np.flatnonzero(np.abs(rates[:, 0]) < _TIED)) if rates.shape[1] == 1 else ()
+    return tuple(np.flatnonzero(np.abs(rates[:, 0]) < _TOL)) if rates.shape[1] == 1 else ()
 
 
 def find_rates(formation: Formation, z: Array) -> Array:
     """Rates of (contacts, joints) in each free direction, (n_c + 2, n), over the largest one."""
-    place, metric = formation.evaluate(z[None], np.zeros((1, 5))), metric_weights(formation.scene)
-    rows = np.vstack([place.A_t[0] / formation.scene.scales.length, np.eye(5)[3:]])
-    rates = rows @ find_freedoms(place.P[0], metric, 1e-9)
+    point, metric = (formation.evaluate(z[None], np.zeros((1, 5))), metric_weights(formation.scene))
+    rows = np.vstack([point.A_t[0] / formation.scene.scales.length, np.eye(5)[3:]])
+    rates = rows @ find_freedoms(point.P[0], metric, 1e-9)
     return np.asarray(rates / np.linalg.norm(rates, axis=1).max(initial=1e-300))
 
 
@@ -221,7 +221,7 @@ def refine(s: Array, stop: float) -> Array:
 
 
 def describe_pose(z: Array) -> str:
-    """Pose of the object in words, from z, q or (x, phi)."""
+    """Pose of the object as text, from z, q or (x, phi)."""
     x, phi = 1e3 * float(z[0]), float(np.degrees(z[min(2, len(z) - 1)]))
     x, phi = round(x, 6) + 0.0, round(phi, 6) + 0.0
     return f"x = {x:.4g} mm, phi = {phi:.4g} deg"

@@ -21,10 +21,10 @@ from ..problem.definition import Phase
 from .curve import tangent_basis
 from .tracing import require_touching, runs_on_curve, trace_phase
 
-GRID = (120, 60)  # samples of x and phi of a formation
-MIN_DISTANCE = 1e-4  # distance from the start, in radii of gyration, that counts as none
-POINTS = 25  # configurations along a guess
-RELEASE_AT = 0.8  # fraction of a curve at which a release is guessed
+GRID_SIZE = (120, 60)  # samples of x and phi of a formation
+MIN_DISTANCE = 1e-4  # distance from the start that counts as zero, in radii of gyration
+N_POINTS = 25  # configurations along a guess
+RELEASE_PLACE = 0.8  # fraction of a curve at which a release is guessed
 
 
 def is_inside(formation: Formation, z: Array) -> bool:
@@ -37,11 +37,11 @@ class Ending:
     """Conditions at the end of a phase."""
 
     formation: Formation  # contacts that are closed
-    fixed: Fixed = ()  # rows of z and the values that they have to take
-    active: tuple[int, ...] = ()  # limits of the formation that are met exactly
+    fixed: Fixed = ()  # rows of z and their prescribed values
+    active: tuple[int, ...] = ()  # limits of the formation that are zero
 
     def measure(self, z: Array) -> Array:
-        """How far configurations with the phase's own contacts closed are from the end [m]."""
+        """Distance of configurations with closed contacts from the end, (n,) [m]."""
         metric = metric_weights(self.formation.scene)
         distance = np.abs(self.formation.evaluate(z, z).C).max(axis=1)
         for row, value in self.fixed:
@@ -52,7 +52,7 @@ class Ending:
         return np.asarray(distance)
 
 
-def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
+def multistart(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
     """Nearest of several ends of a phase from z, (5,), by a multistart over the formation, or None.
 
     Only with palm and both fingers touching, where (x, phi) determines the configuration.
@@ -62,27 +62,27 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
         return None
     metric = metric_weights(formation.scene)
     places = _list_places(formation, z)
-    nearest, least = None, np.inf
+    nearest, min_distance = None, np.inf
     for end in ends:
         for k in np.argsort(end.measure(places))[:24]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
                 continue
             distance = float(np.sqrt(metric @ (goal - z) ** 2))
-            # An end that holds at the start is left out.
-            if MIN_DISTANCE * formation.scene.scales.length < distance < least:
-                nearest, least = goal, distance
+            # Ends at the start do not count.
+            if MIN_DISTANCE * formation.scene.scales.length < distance < min_distance:
+                nearest, min_distance = goal, distance
     return nearest
 
 
 def _list_places(formation: Formation, z: Array) -> Array:
-    """Configurations all over a formation of palm and both fingers, shape (n, 5)."""
+    """Grid of configurations of a formation of palm and both fingers, shape (n, 5)."""
     scene = formation.scene
-    turned = z[2] + np.linspace(-np.pi, np.pi, 721)
+    angles = z[2] + np.linspace(-np.pi, np.pi, 721)
     (lowest,) = (c.index for c in formation.contacts if c.finger is None)
-    turned = turned[lower(scene, turned)[1] == lowest]
-    across = np.linspace(*find_reach(scene), GRID[0])
-    x, phi = np.meshgrid(across, np.linspace(turned.min(), turned.max(), GRID[1]))
+    angles = angles[lower(scene, angles)[1] == lowest]
+    x_range = np.linspace(*find_reach(scene), GRID_SIZE[0])
+    x, phi = np.meshgrid(x_range, np.linspace(angles.min(), angles.max(), GRID_SIZE[1]))
     closed = close_fingers(scene, x.ravel(), phi.ravel()).z
     closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
     gaps = np.abs(formation.evaluate(closed, closed).C).max(axis=1)
@@ -105,7 +105,7 @@ class PathGuess:
     z: Array  # (n, 5): with all contacts closed, evenly spread
     directions: Directions
     # rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses
-    turns: tuple[int, ...] = ()
+    reversals: tuple[int, ...] = ()
 
     @property
     def length(self) -> float:
@@ -117,7 +117,7 @@ class PathGuess:
 def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[PathGuess]:
     """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
-    A phase that ends by a release heads for the end of `later` ones, at the share `RELEASE_AT`.
+    A phase before a release goes to the fraction `RELEASE_PLACE` of the path to a later end.
     """
     formation = phase.formation
     require_touching(phase, z)
@@ -127,13 +127,13 @@ def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[Pat
         raise InputError("", key, "the contacts leave no freedom to move")
     if freedoms == 1:
         curve = trace_phase(phase, z, later)
-        stop = (RELEASE_AT if phase.until.is_release else 1.0) * curve.length
+        stop = (RELEASE_PLACE if phase.until.is_release else 1.0) * curve.length
         parts, guesses = [part for part in curve.segments if part.start < stop], []
         signs = [np.append(part.Xi, part.sigma) for part in parts]
-        for part, here, there in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
-            places = curve.evaluate(np.linspace(part.start, min(part.stop, stop), POINTS)).z
-            turns = tuple(np.flatnonzero(here != there).tolist())
-            guesses.append(PathGuess(formation, places, Directions(part.Xi, part.sigma), turns))
+        for part, sign, next_sign in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
+            places = curve.evaluate(np.linspace(part.start, min(part.stop, stop), N_POINTS)).z
+            reversals = tuple(np.flatnonzero(sign != next_sign).tolist())
+            guesses.append(PathGuess(formation, places, Directions(part.Xi, part.sigma), reversals))
         return guesses
     return [connect(formation, z, _find_goal(phase, z, later))]
 
@@ -150,7 +150,7 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         ends = [after.until for after in later if not after.until.is_release]
         if not ends:
             raise InputError("", key, "is missing; only one freedom needs none")
-        # On the way to where a phase ends next, as far as this one's contacts lead there.
+        # Halfway to the next end of a phase, projected onto this phase's contacts.
         next_end = _find_goal(replace(phase, until=ends[0]), z, later)
         slip = phase.formation.evaluate_slip(z[None])[0]
         middle = close_contacts(phase.formation, (z + next_end) / 2, slip)
@@ -158,7 +158,7 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
     slip, endings = phase.formation.evaluate_slip(z[None])[0], list_ends(phase)
     projected = [_project(end, z, slip) for end in endings]
     goals = [goal for goal, _ in projected if goal is not None]
-    if not goals and (goal := explore(phase.formation, z, slip, endings)) is not None:
+    if not goals and (goal := multistart(phase.formation, z, slip, endings)) is not None:
         goals = [goal]
     if goals:
         metric = metric_weights(phase.formation.scene)
@@ -168,13 +168,13 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
 
 
 def list_ends(phase: Phase) -> list[Ending]:
-    """What has to hold where a phase ends; a contact may be gained in more than one way."""
+    """Alternative end conditions of a phase; a contact may be gained in more than one way."""
     formation, until = phase.formation, phase.until
     if until.contact is None:
         return [Ending(formation, until.poses)]
     count = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
-    # Where a contact changes its name its gap has no slope, but the end of its range has.
+    # The gap of a renamed contact has zero gradient there; the end of its range has not.
     ends = [Ending(formation, until.poses, (k,)) for k in gaining if k < count]
     if not ends or any(k >= count for k in gaining):
         ends.append(Ending(formation.add(until.contact), until.poses))
@@ -182,7 +182,7 @@ def list_ends(phase: Phase) -> list[Ending]:
 
 
 def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
-    """Nearest end by an active-set method with up to two limits, or what blocks it."""
+    """Nearest end by an active-set method with up to two limits, or the blocking limit."""
     formation, active, reason = end.formation, end.active, ""
     for _ in range(3):
         goal = close_contacts(formation, z, slip, end.fixed, active)
@@ -197,9 +197,9 @@ def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
 def connect(formation: Formation, start: Array, goal: Array) -> PathGuess:
     """Straight line projected onto the contacts, with the signs of its mean rates."""
     slip = formation.evaluate_slip(start[None])[0]
-    places = start + np.linspace(0.0, 1.0, POINTS)[1:, None] * (goal - start)
+    places = start + np.linspace(0.0, 1.0, N_POINTS)[1:, None] * (goal - start)
     z = np.vstack([start, close_all(formation, places, slip)])
-    # Where contacts do not close, the path waits.
+    # Points at which contacts do not close repeat the point before.
     last = np.maximum.accumulate(np.where(np.isfinite(z).all(axis=1), np.arange(len(z)), 0))
     z = z[last]
     speed = np.gradient(z, axis=0)

@@ -1,8 +1,8 @@
 """Solution curve z(s) of four constraints, by Chebyshev collocation and Newton, phase by phase.
 
-Four constraints P(z) z' = 0 leave one direction. On each panel the points whose projections on its
-first tangent are Chebyshev-Lobatto nodes are solved for all at once, and the arc length is
-integrated spectrally. No coordinate is singled out: none has to be monotonic.
+Four constraints P(z) z' = 0 leave one direction. A panel has the Chebyshev-Lobatto nodes of the
+projection on its first tangent. Newton's method solves for all its points at once, and the arc
+length is integrated spectrally. No coordinate has to be monotonic.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from ..problem.read import read_problem
 from ..scene.model import TOUCHING, Scene
 from .curve import Curve, Panel, border, describe_pose, refine
 
-NODES = 17  # nodes of a panel
-RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
-SHORTER = 0.5  # factor on the length of a panel whose points are not found
-HELD = 3e-5  # distance to `until`, in radii of gyration or rad, that counts as none
-ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
-LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several turns of the object
+N_NODES = 17  # nodes of a panel
+MAX_TAIL = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
+REDUCTION = 0.5  # factor on the length of a panel if Newton's method fails
+END_TOL = 3e-5  # distance to `until` that counts as zero, in radii of gyration or rad
+LIMIT_ERROR = 3e-10  # violation of a limit that counts as rounding, in radii of gyration
+MAX_LENGTH = 60.0  # longest traced curve, in radii of gyration: several turns of the object
 
 
 @exclusive
@@ -46,7 +46,7 @@ def load(path: str | Path) -> Problem:
 def check_phases(problem: Problem) -> None:
     """Raise an `InputError` if a formation does not touch, or an `until` is never reached.
 
-    An `until` after a phase that may end at several places is left to the planner, which chooses.
+    An `until` after a phase that may end at several places is not checked: the planner selects one.
     """
     from .path_guess import find_end
 
@@ -86,13 +86,13 @@ def runs_on_curve(phase: Phase) -> bool:
 
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
-    """Phases that are planned together: those joined smoothly or by impacts."""
-    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
-    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
+    """Blocks of phases that are planned together: joined smoothly or by impacts."""
+    block_ends = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
+    return [problem.phases[start:stop] for start, stop in pairwise([0, *block_ends])]
 
 
 def runs_on_curves(block: Sequence[Phase]) -> bool:
-    """Whether phases that are planned together run along curves: one, or several that slide."""
+    """Whether a block runs along curves: one phase with one freedom, or several that slide."""
     if len(block) == 1:
         return runs_on_curve(block[0])
     return all(
@@ -106,8 +106,8 @@ def runs_on_curves(block: Sequence[Phase]) -> bool:
 def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
     """Trace a one-freedom phase from `z`, (5,), to its `until`, or to its limits before a release.
 
-    Such a phase heads for the end of `later` ones. Raises an `InputError` if the contacts do not
-    touch or the `until` is never reached.
+    Before a release the direction is that towards the end of `later` phases. Raises an `InputError`
+    if the contacts do not touch or the `until` is never reached.
     """
     require_touching(phase, z)
     formation, until, rho = phase.formation, phase.until, phase.formation.scene.scales.length
@@ -115,20 +115,20 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
     if until.is_release:
         ends = [*(p.until for p in later if not p.until.is_release), until]
         curves = [trace_curve(formation, z, v, until) for v in _headings(formation, z, ends[0])]
-        curve, least = max(curves, key=lambda curve: curve.length), HELD * rho
+        curve, min_length = max(curves, key=lambda curve: curve.length), END_TOL * rho
         same_contacts = later and set(later[0].formation.contacts) == set(formation.contacts)
-        if same_contacts and curves[0].length >= least:
-            # Only modes change, anywhere on the path to the next end of a phase.
+        if same_contacts and curves[0].length >= min_length:
+            # Only modes change, at any place of the path to the next end of a phase.
             curve = curves[0]
-        if curve.length < least:
+        if curve.length < min_length:
             raise InputError("", f"{key}.contacts", f"cannot move: {curve.ending}")
         return curve
-    if _holds(formation, until, z):
+    if _is_reached(formation, until, z):
         raise InputError("", f"{key}.until", f"{until} holds already at the start of the phase")
     endings = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
-        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and curve.is_regular:
+        if curve.reached and until.measure_pins(curve.end, rho) < 3 * END_TOL and curve.is_regular:
             return curve
         endings.append(curve.ending)
     text = f"going one way {endings[0]}, going the other way {endings[1]}"
@@ -137,7 +137,7 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
 
 
 def require_touching(phase: Phase, z: Array) -> None:
-    """Raise an `InputError` unless a phase's contacts touch at `z`, (5,), and nothing overlaps."""
+    """Raise an `InputError` unless a phase's contacts touch at `z`, (5,), without overlap."""
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
@@ -153,13 +153,13 @@ def require_touching(phase: Phase, z: Array) -> None:
         raise InputError("", key, f"cannot hold at {describe_pose(z)}: {text}")
 
 
-def _holds(formation: Formation, until: Until, z: Array) -> bool:
-    """Whether `until` holds at `z`; a contact counts within the ends of its edge and link only."""
+def _is_reached(formation: Formation, until: Until, z: Array) -> bool:
+    """Whether `until` holds at `z`; a contact has to be within the range of its edge and link."""
     if until.contact is None:
-        return bool(EndDistance(formation.scene, until, z).measure(z[None])[0] < HELD)
+        return bool(EndDistance(formation.scene, until, z).measure(z[None])[0] < END_TOL)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
-    return bool(len(gaps) and (np.abs(gaps) < HELD).all())
+    return bool(len(gaps) and (np.abs(gaps) < END_TOL).all())
 
 
 def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
@@ -171,14 +171,14 @@ def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
     return [null, opposite] if next_distance <= distance else [opposite, null]
 
 
-def find_headings(formation: Formation, z: Array, least: float = 1e-7) -> tuple[Array, ...]:
+def find_headings(formation: Formation, z: Array, min_ratio: float = 1e-7) -> tuple[Array, ...]:
     """Both unit tangents of a formation's curve at `z`; none where the curve is singular.
 
-    That is where the ratio of singular values of P is below `least`.
+    That is where the ratio of singular values of P is below `min_ratio`.
     """
     P, metric = formation.evaluate(z[None], z[None]).P[0], metric_weights(formation.scene)
-    freedoms = find_freedoms(P, metric, least).T
-    return () if least and len(freedoms) > 1 else (freedoms[-1], -freedoms[-1])
+    freedoms = find_freedoms(P, metric, min_ratio).T
+    return () if min_ratio and len(freedoms) > 1 else (freedoms[-1], -freedoms[-1])
 
 
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:
@@ -186,9 +186,9 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(replace(until, pins=()))]
     targets = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
-    # A limit that is closed at the start, such as the end of a flush edge that the link does not
-    # reach yet, does not end the phase.
-    closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
+    # A limit that is zero at the start does not end the phase. Case: the end of a flush edge that
+    # the link does not reach yet.
+    closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < END_TOL
     targets = [k for k in targets if not closed[k]] or targets
     targets = [len(names) - 1] if until.contact is None else targets
     end_distance = EndDistance(formation.scene, until, z)
@@ -197,7 +197,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     offset = np.zeros(len(formation.limits))  # limits below zero where the curve begins [rho]
 
     def margins(points: Array) -> Array:
-        # Where a contact is gained is among the limits.
+        # A gained contact is one of the limits.
         distance = end_distance.measure(points) if until.contact is None else np.ones(len(points))
         return np.column_stack([formation.evaluate_limits(points) / rho - offset, distance])
 
@@ -206,7 +206,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
 
     slip = formation.evaluate_slip(z[None])[0]
     step, start, tangent = 0.5 * rho, 0.0, heading
-    while start < LONGEST * rho:
+    while start < MAX_LENGTH * rho:
         panel, factor = build_panel(formation, slip, z, tangent, start, step)
         step *= factor
         if panel is None:
@@ -215,8 +215,8 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
             continue
         panels.append(panel)
         if len(panels) == 1:
-            # A plan ends at a crossing to its own tolerance: limits closed there are measured from
-            # there. Case: phase 5 of `heptagon.toml` with periods of 5 ms, v0-finger2 9e-10 below.
+            # A plan ends within its tolerance: small violations at the start are subtracted. Case:
+            # phase 5 of `heptagon.toml` with periods of 5 ms, v0-finger2 at -9e-10.
             values = formation.evaluate_limits(panel.z[:1])[0] / rho
             offset = np.clip(values, -TOUCHING, 0.0)
         crossing = find_crossing(panel, margins)
@@ -233,8 +233,8 @@ class EndDistance:
     """Distance to the end of a phase that begins at `start`, (5,); NaN for a release [m or rad]."""
 
     def __init__(self, scene: Scene, until: Until, start: Array) -> None:
-        gained = until.contact
-        self.gained = None if gained is None else Formation(scene, (gained,))
+        contact = until.contact
+        self.formation = None if contact is None else Formation(scene, (contact,))
         self.unit = "rad" if until.coordinate == "phi" else "m"
         self.scale = 1.0 if self.unit == "rad" else scene.scales.length
         self.row, value = until.poses[0] if until.value is not None else (0, math.nan)
@@ -242,16 +242,16 @@ class EndDistance:
 
     @staticmethod
     def to_leading(scene: Scene, until: Until, start: Array) -> EndDistance:
-        """Distance to the end by the coordinate with the longest way from the start."""
+        """Distance to the end by the coordinate that is farthest from it at the start."""
         return EndDistance(scene, until.lead(start, scene.scales.length), start)
 
     def evaluate(self, z: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Distance at n states, (n,), its gradient, (n, 5), and its bend, (n,).
+        """Distance d at n states, (n,), its gradient, (n, 5), and its quadratic term, (n,).
 
-        The bend is what the velocity alone adds to its second derivative.
+        d'' = gradient @ z'' + quadratic term in z'.
         """
-        if self.gained is not None:
-            kinematics = self.gained.evaluate(z, v)
+        if self.formation is not None:
+            kinematics = self.formation.evaluate(z, v)
             return kinematics.C[:, 0], kinematics.A[:, 0], kinematics.P_dot_v[:, 0]
         gradient = np.zeros(z.shape)
         gradient[:, self.row] = self.side
@@ -277,8 +277,8 @@ def find_crossing(
         grid = np.append(grid, inner)
         order = grid.argsort()
         grid, values = grid[order], values[order]
-    # A contact that is closed at the start (just released) has to open; rounding is not closing.
-    violated = values < -ROUNDING
+    # A contact that was just released has to open; smaller violations are rounding.
+    violated = values < -LIMIT_ERROR
     if not violated.any():
         return None
     row = int(violated.any(axis=1).argmax())
@@ -288,7 +288,7 @@ def find_crossing(
         return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
 
     for k in np.flatnonzero(violated[row]):
-        if row == 0 or values[row - 1, k] <= 10 * ROUNDING:
+        if row == 0 or values[row - 1, k] <= 10 * LIMIT_ERROR:
             roots[int(k)] = float(grid[max(row - 1, 0)])
         else:
             roots[int(k)] = find_root(partial(margin, int(k)), grid[row - 1], grid[row])
@@ -299,10 +299,10 @@ def find_crossing(
 
 
 def _refine_dips(grid: Array, values: Array) -> Array:
-    """Samples around minima that may fall below zero: no deeper than half the second difference."""
-    before, middle, after = values[:-2], values[1:-1], values[2:]
-    dips = (middle <= before) & (middle <= after) & (middle > ROUNDING)
-    rows = np.flatnonzero((dips & (middle < before - 2 * middle + after)).any(axis=1))
+    """Samples around minima that may be negative, bounded by half the second difference."""
+    left, middle, right = values[:-2], values[1:-1], values[2:]
+    dips = (middle <= left) & (middle <= right) & (middle > LIMIT_ERROR)
+    rows = np.flatnonzero((dips & (middle < left - 2 * middle + right)).any(axis=1))
     if not len(rows):
         return rows.astype(float)
     fractions = np.linspace(0.0, 1.0, 14)[1:-1]
@@ -313,11 +313,11 @@ def _refine_dips(grid: Array, values: Array) -> Array:
 def build_panel(
     formation: Formation, slip: Array, z: Array, heading: Array, start: float, step: float
 ) -> tuple[Panel | None, float]:
-    """Panel of about `step` metres, if it converges, and factor on the next step.
+    """Panel of about `step` metres, None without convergence, and factor on the next step.
 
     Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
     """
-    unit, integrate, analyse = _chebyshev()
+    unit, integral, inverse = _chebyshev()
     metric = metric_weights(formation.scene)
     projection = heading * metric
     u = step * unit
@@ -330,42 +330,41 @@ def build_panel(
         try:
             change = np.linalg.solve(matrix, -residual[..., None])[..., 0]
         except np.linalg.LinAlgError:
-            return None, SHORTER
+            return None, REDUCTION
         points = points + change
         kinematics = formation.evaluate(points, points)
         last_size, size = size, np.abs(change * np.sqrt(metric)).max()
-        # The next change is about the square of this one.
+        # Quadratic convergence: the next change is about the square of this one.
         if size < 3e-8 * rho or size > 10 * rho or (count > 2 and size > last_size / 2):
             break
     if not size < 3e-8 * rho:
-        return None, SHORTER
+        return None, REDUCTION
     z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
     speed = np.sqrt(z_u**2 @ metric)
     scaled = np.column_stack([(points - z) * np.sqrt(metric) / rho, speed])
-    tail = np.abs(analyse @ scaled)[-2:].max()
-    # A trailing coefficient of 0.3 of the largest one is aimed at.
-    factor = (0.3 * RESOLVED / max(tail, 1e-3 * RESOLVED)) ** (1 / (NODES - 1))
-    if speed.max() > 1.5 or tail > RESOLVED:
-        return None, max(min(factor, 0.8), SHORTER**2)
-    return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None]), factor
+    tail = np.abs(inverse @ scaled)[-2:].max()
+    # Target: trailing coefficients of 0.3 `MAX_TAIL`.
+    factor = (0.3 * MAX_TAIL / max(tail, 1e-3 * MAX_TAIL)) ** (1 / (N_NODES - 1))
+    if speed.max() > 1.5 or tail > MAX_TAIL:
+        return None, max(min(factor, 0.8), REDUCTION**2)
+    return Panel(start + step * (integral @ speed), points, z_u / speed[:, None]), factor
 
 
 @lru_cache(maxsize=1)
 def _chebyshev() -> tuple[Array, Array, Array]:
     """Lobatto nodes on [0, 1], the matrix of integrals from 0, and that of coefficients."""
-    x = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
-    analyse = np.asarray(np.linalg.inv(chebyshev.chebvander(x, NODES - 1)), dtype=float)
-    integral = chebyshev.chebvander(x, NODES) @ chebyshev.chebint(np.eye(NODES), lbnd=-1)
-    return (1 + x) / 2, (integral - integral[0]) @ analyse / 2, analyse
+    x = -np.cos(np.pi * np.arange(N_NODES) / (N_NODES - 1))
+    inverse = np.asarray(np.linalg.inv(chebyshev.chebvander(x, N_NODES - 1)), dtype=float)
+    integral = chebyshev.chebvander(x, N_NODES) @ chebyshev.chebint(np.eye(N_NODES), lbnd=-1)
+    return (1 + x) / 2, (integral - integral[0]) @ inverse / 2, inverse
 
 
 @dataclass(frozen=True, eq=False)
 class CostToGo:
-    """The cost of the phases that follow, the first of them with one freedom."""
+    """Cost of the later phases, the first of them with one freedom."""
 
-    phase: Phase  # the first of them. Its curve is where the motion before it may end.
-    # their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a plan
-    # from there.
+    phase: Phase  # the first later phase; the earlier motion may end anywhere on its curve
+    # least cost from a configuration z, shape (5,); raises a `WholearmError` if none has a plan
     value: Callable[[Array], float]
 
     def expand(self, z: Array) -> tuple[float, Array]:

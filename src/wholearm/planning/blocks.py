@@ -34,7 +34,7 @@ from ..results.report import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .lower_bound import sweep_time
-from .nlp import charge
+from .nlp import assign_costs
 from .options import Objective, PlanOptions
 from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import (
@@ -231,7 +231,7 @@ def plan_block(
         return plan_rate_limited(planning, chain), chain
     plans: Plans = []
     for part in chain.split():
-        with charge(part.phases[0].number):
+        with assign_costs(part.phases[0].number):
             duration = planning.sum_durations(part.phases)
             task = part.make_task(problem.epsilon, options, duration)
             curves = enumerate(planning.curves, 1)
@@ -272,7 +272,7 @@ def _plan_over_time(
         plan: Callable[[float | None], Plans] = partial(
             plan_with_impacts, problem, block, z, options, **guesses, **arguments
         )
-        with charge(block[0].number):
+        with assign_costs(block[0].number):
             try:
                 if limited and not coarse:
                     return plan_with_pauses(planning, block, plan, duration)
@@ -534,7 +534,7 @@ def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
         if duration is not None and junction is not None:
             duration -= junction.change.duration
         task = replace(part.make_task(epsilon, options, duration), pins=pins)
-        with charge(number):
+        with assign_costs(number):
             plan: Plans = [*plan_curves(task)]
         if junction is not None:
             plan[0] = add_pause(plan[0], junction.change, first.formation, options)

@@ -44,7 +44,7 @@ from ..problem.definition import Phase, Problem, Until
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
-from .nlp import open_ledger, setting
+from .nlp import collect_costs, setting
 from .options import PlanOptions
 from .path_domain.path_data import fit_torque
 from .path_domain.path_plan import PathIterate, Pins, Task, plan_curves, require_unique
@@ -82,10 +82,10 @@ def advise(
     if replan is None or _unadvised.get():
         return error
     undecided = list[Parameter]()
-    with open_ledger() as ledger:
+    with collect_costs() as costs:
 
         def is_over(parameter: Parameter) -> bool:
-            exhausted = sum(cost.iterations for cost in ledger.values()) > max_iter
+            exhausted = sum(cost.iterations for cost in costs.values()) > max_iter
             undecided.extend([parameter] * exhausted)
             return exhausted
 

@@ -1,9 +1,9 @@
-"""Nonlinear programmes: named blocks, assembly from kernels, Ipopt, and what solving costs.
+"""Nonlinear programmes: named blocks, assembly from kernels, Ipopt, and solver statistics.
 
-An NLP over time is assembled from linear rows and from copies of kernels, with its derivatives. A
-kernel is an expression with derivatives that is built once, for all formations with the same
-equations. Its copies have other unknowns and parameters. Ipopt has the same options for all NLPs;
-it stops on signals, and its runs are recorded.
+An NLP over time is assembled, with its derivatives, from linear rows and from copies of kernels. A
+kernel is an expression with derivatives, built once for all formations with the same equations.
+Its copies have different unknowns and parameters. All NLPs have the same Ipopt options. Signals
+interrupt Ipopt, and its runs are recorded.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from ..contacts.formation import Formation
 _T = TypeVar("_T")
 Indices = Numbers
 Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
-STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
-_OPTIONS = {
+INTERRUPTED = "User_Requested_Stop"  # status of a solver after an interrupt only
+_IPOPT_OPTIONS = {
     "print_level": 0,
     "sb": "yes",
     "tol": 1e-8,
-    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
+    # The default relaxes every bound by 1e-8: success would not imply that limits hold.
     "bound_relax_factor": 0.0,
     "fast_step_computation": "yes",
-    # A fixed ordering: the automatic one can differ between machines, and is slow on long grids.
+    # Fixed ordering: the automatic one can differ between machines, and is slow on long grids.
     "mumps_permuting_scaling": 0,
     "mumps_pivot_order": 0,
-    # Starting from a solution then takes few iterations.
+    # Few iterations from a previous solution.
     "mu_strategy": "adaptive",
     "warm_start_init_point": "yes",
 }
 
 
 class Columns:
-    """Named blocks of a vector, one after the other, by their sizes."""
+    """Named successive blocks of a vector, by their sizes."""
 
     def __init__(self, **sizes: int) -> None:
         self.sizes = sizes
@@ -59,10 +59,10 @@ class Columns:
     def __getitem__(self, name: str) -> slice:
         return self.slices[name]
 
-    def make_symbols(self, **known: Expression) -> Symbols:
-        """A column of symbols for each block that is not `known`; `every` is all in one."""
-        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()} | known
-        return SimpleNamespace(**symbols, columns=self, every=self.write(**symbols))
+    def make_symbols(self, **expressions: Expression) -> Symbols:
+        """Columns of symbols, or given `expressions`, of each block; `stack` has all in one."""
+        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()} | expressions
+        return SimpleNamespace(**symbols, columns=self, stack=self.write(**symbols))
 
     def write(self, **blocks: Expression) -> Expression:
         """One column of expressions, block by block."""
@@ -70,16 +70,16 @@ class Columns:
         return ca.vertcat(ca.SX(0, 1), *(ca.vec(blocks[name]) for name in self.sizes))
 
     def join(self, **blocks: Any) -> Any:
-        """One array of shape (..., count) from those of all blocks, broadcast in other axes."""
+        """Concatenate arrays of all blocks, broadcast in other axes, to shape (..., count)."""
         tables = {name: np.asarray(block) for name, block in blocks.items()}
         self._check({name: table.shape[-1] for name, table in tables.items()})
         shape = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
         parts = [np.broadcast_to(tables[name], (*shape, self.sizes[name])) for name in self.sizes]
         return np.concatenate(parts or [np.zeros(0)], axis=-1)
 
-    def _check(self, given: dict[str, int]) -> None:
-        if given != self.sizes:
-            raise ValueError(f"columns {given} are given where {self.sizes} are declared")
+    def _check(self, sizes: dict[str, int]) -> None:
+        if sizes != self.sizes:
+            raise ValueError(f"columns {sizes} are given where {self.sizes} are declared")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +102,16 @@ def build_kernel(x: Symbols, p: Symbols | None = None, **y: Expression) -> Kerne
     columns = Columns(**{name: int(block.numel()) for name, block in y.items()})
     value = ca.densify(columns.write(**y))
     lam = ca.SX.sym("lam", columns.count)
-    J = ca.jacobian(value, x.every)
-    H = ca.triu(ca.hessian(ca.dot(lam, value), x.every)[0])
+    J = ca.jacobian(value, x.stack)
+    H = ca.triu(ca.hessian(ca.dot(lam, value), x.stack)[0])
 
     def list_entries(matrix: Expression) -> Expression:
         return ca.vertcat(*matrix.nonzeros()) if matrix.nnz() else ca.SX(0, 1)
 
     return Kernel(
-        ca.Function("value", [x.every, p.every], [value]),
-        ca.Function("jacobian", [x.every, p.every], [list_entries(J)]),
-        ca.Function("hessian", [x.every, p.every, lam], [list_entries(H)]),
+        ca.Function("value", [x.stack, p.stack], [value]),
+        ca.Function("jacobian", [x.stack, p.stack], [list_entries(J)]),
+        ca.Function("hessian", [x.stack, p.stack, lam], [list_entries(H)]),
         np.array(J.sparsity().get_triplet(), dtype=np.int64),
         np.array(H.sparsity().get_triplet(), dtype=np.int64),
         x.columns,
@@ -124,21 +124,21 @@ def _identify(*args: Any) -> tuple[Any, ...]:
     return tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
 
 
-share = stored(_identify, max_size=64)
-"""Has a function keep its last kernels, each for all formations with the same equations."""
+cached_kernel = stored(_identify, max_size=64)
+"""Decorator: caches kernels, each for all formations with the same equations."""
 
 
 class _Block(NamedTuple):
     """Copies of a kernel."""
 
     kernel: Kernel
-    columns: Indices  # (n, n_x): the unknowns that are each copy's x, no one twice
-    rows: Indices  # (n, n_y): the constraints that are its y; shape (n, 0) if y is part of the cost
+    columns: Indices  # (n, n_x): unknowns of each copy, without repetition
+    rows: Indices  # (n, n_y): constraints of each copy; (n, 0) if y is part of the cost
     parameters: Array  # (n, n_p)
 
 
 class NlpRows:
-    """Constraints in the order in which they are added, with their bounds, and shares of a cost."""
+    """Constraints with bounds, in the order in which they are added, and terms of the cost."""
 
     def __init__(self) -> None:
         self._blocks: list[_Block] = []
@@ -156,18 +156,18 @@ class NlpRows:
         return rows
 
     def linear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
-        """Rows that are sums of unknowns, equal to zero unless bounds are given."""
+        """Linear rows without entries, with given bounds (default: equal to zero)."""
         rows = self._add_rows(*shape, low=low, high=high)
         self._linear.append(rows.ravel())
         return rows
 
     def add_entries(self, rows: Any, columns: Any, values: Any) -> None:
-        """Add entries to linear rows; the three are broadcast against one another."""
+        """Add entries to linear rows; the arguments are broadcast."""
         parts = np.broadcast_arrays(rows, columns, np.asarray(values, dtype=float))
         self._entries.append((parts[0].ravel(), parts[1].ravel(), parts[2].ravel()))
 
     def add_equal(self, columns: Any, others: Any, scale: Any = 1.0) -> Indices:
-        """Add rows by which unknowns, times a scale, are those of others; shape of `columns`."""
+        """Add rows scale (x[columns] - x[others]) = 0, of the shape of `columns`."""
         rows = self.linear(*np.shape(columns))
         self.add_entries(rows, columns, scale)
         self.add_entries(rows, others, -np.asarray(scale))
@@ -185,8 +185,8 @@ class NlpRows:
     ) -> Indices:
         """Add copies of a kernel with blocks of unknowns `x` and parameters `p` as rows or a cost.
 
-        One for all but the last axis of the blocks, which are broadcast. Returns the rows, equal to
-        zero unless bounds are given.
+        One copy per element of all axes but the last; blocks are broadcast. Returns the rows, with
+        given bounds (default: equal to zero).
         """
         columns = kernel.x.join(**x)
         shape, count = columns.shape[:-1], columns[..., 0].size
@@ -207,29 +207,29 @@ class NlpRows:
     ) -> tuple[dict[str, Expression], dict[str, Expression]]:
         """Expressions of x, p, f and g with a linear cost, (n,), and `jac_g` and `hess_lag`.
 
-        p are prices of some unknowns. All rows that are not linear belong to one copy of a kernel.
+        p are cost coefficients of the unknowns `priced`. Other rows belong to copies of kernels.
         """
-        size, blocks, none = len(cost), self._blocks, [np.zeros(0, dtype=np.int64)]
-        linear = np.concatenate(self._linear or none)
+        size, blocks, empty = len(cost), self._blocks, [np.zeros(0, dtype=np.int64)]
+        linear = np.concatenate(self._linear or empty)
         row, column, value = (
-            np.concatenate([part[k] for part in self._entries] or none) for k in range(3)
+            np.concatenate([part[k] for part in self._entries] or empty) for k in range(3)
         )
         x, p, lam_f = ca.MX.sym("x", size), ca.MX.sym("p", len(priced)), ca.MX.sym("lam_f")
         order = np.argsort(
             np.concatenate([linear, *(b.rows.ravel() for b in blocks)]), kind="stable"
         )
         lam_g = ca.MX.sym("lam_g", len(order))
-        place = np.full(len(order), -1)
-        place[linear] = np.arange(len(linear))
-        entries = place[row].tolist(), column.tolist(), ca.DM(value)
+        linear_index = np.full(len(order), -1)
+        linear_index[linear] = np.arange(len(linear))
+        entries = linear_index[row].tolist(), column.tolist(), ca.DM(value)
         parts = [ca.DM.triplet(*entries, len(linear), size) @ x]
         f = ca.dot(ca.DM(cost), x) + ca.dot(p, x[priced.tolist()])
         jac_rows, jac_columns, jac = [row], [column], [ca.MX(ca.DM(value))]
-        places, hess = [], []
+        hess_index, hess = [], []
         for kernel, columns, rows, parameters in blocks:
             count, values = len(columns), ca.DM(parameters.T)
-            here = _select(x, columns)
-            y = kernel.function.map(count)(here, values)
+            x_copies = _select(x, columns)
+            y = kernel.function.map(count)(x_copies, values)
             lam = ca.repmat(lam_f, 1, count)
             if rows.size:
                 parts.append(ca.vec(y))
@@ -237,12 +237,12 @@ class NlpRows:
                 i, j = kernel.jacobian_at
                 jac_rows.append(rows[:, i].ravel())
                 jac_columns.append(columns[:, j].ravel())
-                jac.append(ca.vec(kernel.jacobian.map(count)(here, values)))
+                jac.append(ca.vec(kernel.jacobian.map(count)(x_copies, values)))
             else:
                 f += ca.sum2(y)
-            ends = columns[:, kernel.hessian_at]
-            places.append((ends.max(axis=1) * size + ends.min(axis=1)).ravel())
-            hess.append(ca.vec(kernel.hessian.map(count)(here, values, lam)))
+            pairs = columns[:, kernel.hessian_at]
+            hess_index.append((pairs.max(axis=1) * size + pairs.min(axis=1)).ravel())
+            hess.append(ca.vec(kernel.hessian.map(count)(x_copies, values, lam)))
         g = ca.vertcat(*parts)[order.tolist()]
         jac_row, jac_column = np.concatenate(jac_rows), np.concatenate(jac_columns)
         sort = np.lexsort((jac_row, jac_column))
@@ -250,7 +250,7 @@ class NlpRows:
             len(order), size, jac_row[sort].tolist(), jac_column[sort].tolist()
         )
         jacobian = ca.MX(pattern, ca.vertcat(*jac)[sort.tolist()])
-        unique, owner = np.unique(np.concatenate(places or none), return_inverse=True)
+        unique, owner = np.unique(np.concatenate(hess_index or empty), return_inverse=True)
         ones = owner.tolist(), list(range(len(owner))), ca.DM.ones(len(owner))
         gather = ca.DM.triplet(*ones, len(unique), len(owner))
         pattern = ca.Sparsity.triplet(
@@ -279,26 +279,26 @@ def build_solver(
     Parameters
     ----------
     nlp          expressions of x, p, f and g
-    push         distance of an initial point from its bounds; small to start at a solution
-    derivatives  functions that CasADi would derive otherwise: `jac_g` and `hess_lag`
-    **options    of Ipopt, over those that all NLPs share
+    push         minimum distance of the initial point from bounds; small for a warm start
+    derivatives  functions `jac_g` and `hess_lag`; by default CasADi derives them
+    **options    of Ipopt, in addition to those of all NLPs
     """
     kinds = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
     pushes = {f"warm_start_{kind}": push for kind in kinds}
     casadi_options = {
-        "ipopt": _OPTIONS | pushes | options,
+        "ipopt": _IPOPT_OPTIONS | pushes | options,
         "print_time": False,
         "record_time": True,
-        # Neither multipliers of parameters nor their gradient are used, and both cost.
+        # Multipliers of parameters and their gradient take time and are not used.
         "calc_lam_p": False,
         "no_nlp_grad": True,
         "show_eval_warnings": False,
         "error_on_fail": False,
         **(derivatives or {}),
     }
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     solver = Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
-    book(SolverStatistics(build_time=time.perf_counter() - started))
+    add_cost(SolverStatistics(build_time=time.perf_counter() - start_time))
     return solver
 
 
@@ -314,30 +314,30 @@ class IpoptRun(NamedTuple):
 
 
 class Solver:
-    """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
+    """An NLP solver that raises KeyboardInterrupt; CasADi would report a failure instead."""
 
     def __init__(self, function: Expression) -> None:
         self.function = function
 
     def __call__(self, **arguments: Any) -> dict[str, Expression]:
-        """Solve; inputs and outputs are those of a CasADi NLP solver, also `success` and `status`.
+        """Solve; inputs and outputs of a CasADi NLP solver, with `success` and `status`.
 
-        KeyboardInterrupt if a signal stopped the solver, or the time is over (`OutOfTime`).
+        Raises KeyboardInterrupt after a signal, `OutOfTime` after the time limit.
         """
         beat()
-        # CasADi takes lists in three times as fast as arrays.
+        # CasADi reads lists three times as fast as arrays.
         lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
         result: dict[str, Expression] = self.function(**lists)
         stats = self.function.stats()
-        # A solver that was stopped does not always say what it has done.
+        # Statistics of an interrupted solver may be missing.
         count, *times = (
             stats.get(key, 0) for key in ("iter_count", "t_wall_total", "t_proc_total")
         )
-        stopped = stats["return_status"] == STOPPED
-        runs = [] if stopped else [IpoptRun(*self._sizes, count, times[1])]
-        book(SolverStatistics(solves=1, iterations=count, solve_time=times[0]), *runs)
+        interrupted = stats["return_status"] == INTERRUPTED
+        runs = [] if interrupted else [IpoptRun(*self._sizes, count, times[1])]
+        add_cost(SolverStatistics(solves=1, iterations=count, solve_time=times[0]), *runs)
         check()
-        if stopped:
+        if interrupted:
             raise KeyboardInterrupt
         return result | {"success": stats["success"], "status": stats["return_status"]}
 
@@ -350,7 +350,7 @@ class Solver:
 
 
 class IterateRecord(NamedTuple):
-    """One iterate of a refinement."""
+    """An iterate of a refinement."""
 
     violation: float  # the largest violation of limits between nodes, over the allowed one
     error: float  # estimated relative error of the objective; NaN where limits are missed
@@ -358,11 +358,11 @@ class IterateRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class SolverStatistics:
-    """Cost of solving, and what refinements gained by it."""
+    """Cost of solving, and convergence of refinements."""
 
     iterations: int = 0  # of Ipopt
-    solves: int = 0  # how often it ran
-    build_time: float = 0.0  # [s]: of NLPs that were not cached
+    solves: int = 0  # number of runs of Ipopt
+    build_time: float = 0.0  # [s]: of NLPs that were not in the cache
     solve_time: float = 0.0  # [s]: of Ipopt
     iterates: tuple[IterateRecord, ...] = ()
 
@@ -370,21 +370,21 @@ class SolverStatistics:
         return SolverStatistics(*map(add, astuple(self), astuple(other)))
 
 
-class Ledger(defaultdict[int, SolverStatistics]):
-    """Costs by the number of the phase that they were for, 0 for none; `runs` of all solvers."""
+class Costs(defaultdict[int, SolverStatistics]):
+    """Costs by phase number, 0 for those of no phase; `runs` of all solvers."""
 
     def __init__(self) -> None:
         super().__init__(SolverStatistics)
         self.runs = list[IpoptRun]()
 
 
-_LEDGERS: ContextVar[tuple[Ledger, ...]] = ContextVar("ledgers", default=())  # those that are open
+_RECORDS: ContextVar[tuple[Costs, ...]] = ContextVar("ledgers", default=())  # active
 _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 
 
 @contextmanager
 def setting(variable: ContextVar[_T], value: _T) -> Iterator[None]:
-    """Give a variable another value inside the block."""
+    """Set a variable inside the block."""
     token = variable.set(value)
     try:
         yield
@@ -393,20 +393,20 @@ def setting(variable: ContextVar[_T], value: _T) -> Iterator[None]:
 
 
 @contextmanager
-def open_ledger() -> Iterator[Ledger]:
-    """Collect what solving costs inside the block."""
-    ledger = Ledger()
-    with setting(_LEDGERS, (*_LEDGERS.get(), ledger)):
-        yield ledger
+def collect_costs() -> Iterator[Costs]:
+    """Record the cost of solving inside the block."""
+    record = Costs()
+    with setting(_RECORDS, (*_RECORDS.get(), record)):
+        yield record
 
 
-def charge(phase: int) -> AbstractContextManager[None]:
-    """Book what solving costs inside the block to a phase, by its number."""
+def assign_costs(phase: int) -> AbstractContextManager[None]:
+    """Assign the cost of solving inside the block to a phase, by its number."""
     return setting(_PHASE, phase)
 
 
-def book(cost: SolverStatistics, *runs: IpoptRun) -> None:
-    """Add a cost, and the runs that it is of, to all ledgers that are open."""
-    for ledger in _LEDGERS.get():
-        ledger[_PHASE.get()] += cost
-        ledger.runs.extend(runs)
+def add_cost(cost: SolverStatistics, *runs: IpoptRun) -> None:
+    """Add a cost, and the runs that caused it, to all active records."""
+    for record in _RECORDS.get():
+        record[_PHASE.get()] += cost
+        record.runs.extend(runs)

@@ -30,7 +30,7 @@ from ..results.trajectory import Trajectory
 from ..verification.verify import EXACT_REST, find_stuck, find_uniqueness_margin
 from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
-from .nlp import charge, open_ledger
+from .nlp import assign_costs, collect_costs
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import plan_curves
@@ -109,7 +109,7 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
     options = options.scale_ranges(problem.ranges)
     if problem.scene.control_period:
         options = replace(options, transcription="time")
-    with open_ledger() as ledger:
+    with collect_costs() as costs:
         t_start = time.perf_counter()
         report("tracing the phases")
         curves = trace_phases(problem)
@@ -140,7 +140,7 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         phases = tuple(
             PlannedPhase(
                 phase.number,
-                ledger[phase.number],
+                costs[phase.number],
                 plan.value,
                 plan.motion.duration,
                 tuple(contact.name for contact in phase.formation.rolling),
@@ -206,7 +206,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
                 report(f"phase {impact.phase}: what its impact saves")
                 end = impact.phase - first
                 bounds = max(k for k in stops if k < end), end, min(k for k in stops if k > end)
-                with charge(impact.phase):
+                with assign_costs(impact.phase):
                     impact = impact._replace(saves=_find_saving(planning, block, bounds, planner))
             transitions.append(impact)
     return transitions

@@ -12,7 +12,7 @@ import math
 from typing import Protocol, Self, TypeVar
 
 from ..common.errors import SolverError
-from .nlp import IterateRecord, SolverStatistics, book
+from .nlp import IterateRecord, SolverStatistics, add_cost
 
 SOLVES = 40  # most of one refinement
 
@@ -63,7 +63,7 @@ def refine(first: I, accuracy: float = 0.0, solves: int = SOLVES) -> I:
             continue
         violation = iterate.violation
         record = IterateRecord(violation, iterate.error if violation <= 1 else math.nan)
-        book(SolverStatistics(iterates=(record,)))
+        add_cost(SolverStatistics(iterates=(record,)))
         if violation <= 1 and (best is None or record.error <= best.error):
             best = iterate
             if record.error <= accuracy:

@@ -13,7 +13,7 @@ from ..common.arrays import Array, Numbers
 from ..contacts.elemental import Contact
 from ..contacts.formation import CurvePoint, Formation
 from ..geometry.curve import Curve, describe_pose, directions_of
-from ..geometry.tracing import HELD, find_headings, trace_curve
+from ..geometry.tracing import END_TOL, find_headings, trace_curve
 from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import NoMotionError, find_duration, make_cosine_grid, speed_sweep
@@ -188,7 +188,7 @@ class BorderEdge:
         values = np.abs(formation.evaluate_limits(np.array([self.curve.start, self.curve.end])))
         touching = values[1] < formation.scene.touching
         # A contact that is closed at the start, such as the end of a flush edge, is not gained.
-        was_open = values[0] > HELD * formation.scene.scales.length
+        was_open = values[0] > END_TOL * formation.scene.scales.length
         rows = [*np.flatnonzero(touching & was_open), *np.flatnonzero(touching)]
         return next(filter(None, (formation.limits[k].gained for k in rows)), None)
 
@@ -247,7 +247,7 @@ def follow_borders(
     place: RoadmapPlace, formation: Formation, epsilon: float, uniqueness_margin: float
 ) -> list[BorderEdge]:
     """The border of a formation from a place, in both directions."""
-    headings, step = find_headings(formation, place.z), HELD * place.scene.scales.length
+    headings, step = find_headings(formation, place.z), END_TOL * place.scene.scales.length
     if not headings:
         return []
     # Most borders end at their start: a limit is violated after a small step.

@@ -28,7 +28,7 @@ from ..common.fields import Range
 from ..common.files import digest_package, make_folder, write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, interrupt_at_beat, interruptible, limit_time
-from ..geometry.tracing import HELD
+from ..geometry.tracing import END_TOL
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
@@ -103,7 +103,7 @@ def find_route(
         key, roadmap = get_roadmap(problem, settings, cache)
         answers, start, elapsed = list[Answer](), problem.start, 0.0
         for index, entry in enumerate(problem.goals):
-            goal = entry.with_edge(problem.scene, HELD)
+            goal = entry.with_edge(problem.scene, END_TOL)
             place = make_place(problem.scene, start)
             if is_at(place, goal):
                 reason = f"{goal} holds already where the motion starts"

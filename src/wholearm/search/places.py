@@ -15,7 +15,7 @@ from ..contacts.closing import close_fingers, describe_obstacle, describe_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose
-from ..geometry.tracing import HELD, EndDistance, find_crossing
+from ..geometry.tracing import END_TOL, EndDistance, find_crossing
 from ..mechanics.dynamics import close_contacts
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene
@@ -89,7 +89,7 @@ def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
 
 def lies_on_edge(scene: Scene, contacts: Sequence[Contact], z: Array, goal: Goal) -> bool:
     """Whether the edge of a goal lies on the palm, at the goal's angle, with these contacts."""
-    if goal.flush is None or (goal.phi is not None and abs(z[2] - goal.phi) >= HELD):
+    if goal.flush is None or (goal.phi is not None and abs(z[2] - goal.phi) >= END_TOL):
         return False
     ends = {goal.flush, (goal.flush + 1) % scene.polygon.n_vertices}
     return ends <= {c.index for c in contacts if c.finger is None}
@@ -98,12 +98,12 @@ def lies_on_edge(scene: Scene, contacts: Sequence[Contact], z: Array, goal: Goal
 def is_at(place: RoadmapPlace, goal: Goal) -> bool:
     """Whether a place is a goal."""
     scene = place.scene
-    if goal.x is not None and abs(place.z[0] - goal.x) > HELD * scene.scales.length:
+    if goal.x is not None and abs(place.z[0] - goal.x) > END_TOL * scene.scales.length:
         return False
     if goal.flush is not None:
         return lies_on_edge(scene, place.contacts, place.z, goal)
     assert goal.phi is not None
-    return bool(abs(place.z[2] - goal.phi) < HELD)
+    return bool(abs(place.z[2] - goal.phi) < END_TOL)
 
 
 def locate_goal(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
@@ -118,14 +118,14 @@ def locate_goal(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
             return None
         until = Until(coordinate="x", value=goal.x)
     distance = EndDistance(scene, until, curve.start)
-    if distance.measure(curve.start[None])[0] < HELD:
+    if distance.measure(curve.start[None])[0] < END_TOL:
         return None
     crossings = (find_crossing(p, lambda z: distance.measure(z)[:, None]) for p in curve.panels)
     s = next((crossing[0] for crossing in crossings if crossing), math.inf)
     if s > curve.length:
         return None
     x = float(curve.interpolate(np.array([s]))[0][0, 0])
-    if goal.x is not None and abs(x - goal.x) > HELD * scene.scales.length:
+    if goal.x is not None and abs(x - goal.x) > END_TOL * scene.scales.length:
         return None
     return s, until
 

@@ -1,20 +1,20 @@
 """Motion with contacts from complementarity problems: events, contact modes, impacts.
 
-At every event the contact modes are the solution of a contact problem that changes the fewest
-modes (Stewart and Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
-collisions and Coulomb friction", 1996; exact in the plane). With the forces c_n >= 0 of contacts
-and f of everything that stands still and may stick (contacts and joints), rates r = (r_n, r_t)
-follow linearly,
+At every event the contact modes solve a linear complementarity problem (Stewart and Trinkle, "An
+implicit time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb
+friction", 1996; exact in the plane). Of several solutions the one that changes the fewest modes is
+used. Unknowns are normal forces c_n >= 0 and friction forces f of contacts and joints at rest.
+Normal rates r_n and sliding rates r_t are linear in them,
 
     r_n = b_n + A M^-1 (G^T c_n + T^T f),      r_t = b_t + T M^-1 (G^T c_n + T^T f),
 
-and have to keep r_n >= 0 and c_n r_n = 0, abs(f) <= bound, and f opposite to r_t and at its bound
-wherever r_t is not zero. The bound is mu c_n of a contact and D of a joint. Rates are accelerations
-while forces act, and velocities in an impact. A contact that slides already has its friction in
-G = A - mu Xi A_t. Splitting f into its parts of either sign makes the problem linear.
+with r_n >= 0, c_n r_n = 0 and abs(f) <= bound. If r_t is not zero, f is opposite to it and at its
+bound: mu c_n of a contact, D of a joint. Rates are accelerations while forces act, and velocities
+in an impact. Friction of a sliding contact is part of G = A - mu Xi A_t. The problem is linear in
+the positive and negative parts of f.
 
-Problems are evaluated a short time later, at the state that present accelerations lead to: a
-force's trend counts. The last modes are tried first, then Lemke's method.
+Problems are posed a short time later, at the extrapolated state, as forces may leave their bounds
+by then. The last modes are tried first, then Lemke's method.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from ..results.trajectory import interpolate_quintic
 from .events import EventKind, Outcome, OutcomeKind, describe_change
 from .modes import find_breach
 from .run import Run, StuckError
-from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Modes, System
+from .system import EVENT_DELAY, ROUNDING_FORCE, ZERO_ACCEL, ZERO_SPEED, ContactRows, Modes, System
 
-EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
-SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
-SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
-MOST = 600  # most choices of modes that are enumerated: all of one to three contacts and two joints
-APART, STICKS, FORTH, BACK = range(4)
-"""Modes of a contact; of a joint all but the first. One without friction that presses sticks."""
-MODES = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}  # by sliding sign
-CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
-SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
-CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
-DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
-ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
-LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
-REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
+FRICTION_MARGIN = 1e-9  # friction margin that counts as zero, over its bound or the largest force
+RATE_TOLERANCE = 1e-6  # difference of equal rates, over the largest rate without contact forces
+MIN_DETERMINANT = 1e-9  # determinant of a scaled system that counts as zero
+MAX_CHOICES = 600  # most mode choices that are enumerated; 576 for 3 contacts and 2 joints
+SEPARATED, STICKING, POSITIVE, NEGATIVE = range(4)
+"""Modes of a contact; joints have the last three. A frictionless contact that presses sticks."""
+MODE_OF_SIGN = {0.0: STICKING, 1.0: POSITIVE, -1.0: NEGATIVE}  # by sliding sign
+CLOSED_GAP = 1e-10  # gap that counts as closed at an event, over the scene's length
+MAX_OVERLAP = 1e-6  # largest overlap of a contact, over the scene's length
+CHATTER_SPEED = 1e-6  # speed of the last impact, over the scene's; it separates by rounding only
+MIN_SINE = 1e-7  # sine of the angle between constraint rows below which they are dependent
+MIN_GAP = 1e-13  # smallest gap of a separated pair, over the scene's length
+GAP_SAMPLES = 8  # gap samples in the longest step, its end included
+MAX_STEP = 0.3  # longest step, in units of the scene; gaps: every `MAX_STEP` / `GAP_SAMPLES`
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """k contacts, s of whatever stands still and may stick, n coordinates."""
+    """Contact problem of k contacts, s contacts and joints at rest, and n coordinates."""
 
-    lift: Array  # (n,): diagonal of M^-1
+    inverse_mass: Array  # (n,): diagonal of M^-1
     A: Array  # A, G (k, n):
     G: Array
     b_n: Array  # (k,): normal rates without forces
@@ -67,196 +67,202 @@ class ContactProblem:
 
     @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
-        """Units of forces that make the diagonal one, the matrix in them, and the rates without."""
-        rows, pushes = (np.concatenate([part, self.T]) for part in (self.A, self.G))
-        lifted, k = rows * self.lift, len(self.b_n)
-        units = 1 / np.sqrt((lifted * rows).sum(axis=1))
-        K = (lifted @ pushes.T) * (units[:, None] * units)
+        """Scaling to a unit diagonal: units of c_n and f, matrix K, and rates q without forces."""
+        rows, force_rows = (np.concatenate([part, self.T]) for part in (self.A, self.G))
+        weighted, k = rows * self.inverse_mass, len(self.b_n)
+        units = 1 / np.sqrt((weighted * rows).sum(axis=1))
+        K = (weighted @ force_rows.T) * (units[:, None] * units)
         return units[:k], units[k:], K, units * np.concatenate([self.b_n, self.b_t])
 
-    def describe(self, answer: ContactAnswer) -> list[int]:
-        """Modes of an answer as `list_answers` has them."""
-        choice = [STICKS if c > 0 else APART for c in answer.c_n]
-        for owner, sign in zip(self.owner.tolist(), answer.sign.tolist(), strict=True):
+    def find_choice(self, solution: ContactSolution) -> list[int]:
+        """Modes of a solution, as the `choice` of `list_solutions`."""
+        choice = [STICKING if c > 0 else SEPARATED for c in solution.c_n]
+        for owner, sign in zip(self.owner.tolist(), solution.sign.tolist(), strict=True):
             if owner < 0:
-                choice.append(MODES[sign])
-            elif choice[owner] != APART:
-                choice[owner] = MODES[sign]
+                choice.append(MODE_OF_SIGN[sign])
+            elif choice[owner] != SEPARATED:
+                choice[owner] = MODE_OF_SIGN[sign]
         return choice
 
 
-class ContactAnswer(NamedTuple):
-    """One solution."""
+class ContactSolution(NamedTuple):
+    """A solution of a contact problem."""
 
     c_n: Array  # (k,)
     f: Array  # (s,)
     r_n: Array  # (k,)
-    shares: Array  # (s,): friction over the most that it may be
-    sign: Array  # (s,): sliding sign where friction is at its bound, 0 where it holds
+    ratios: Array  # (s,): friction over its bound
+    sign: Array  # (s,): sliding sign if friction is at its bound, otherwise 0
     change: Array  # (n,): M^-1 (G^T c_n + T^T f)
     residual: float  # over the largest rate without contacts, 1e-8 at most
 
 
-def solve_problem(p: ContactProblem) -> ContactAnswer | None:
-    """One solution by Lemke's method, or none."""
+def solve_problem(p: ContactProblem) -> ContactSolution | None:
+    """A solution by Lemke's method; None if it fails."""
     s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
-    held = (p.owner >= 0).nonzero()[0]
-    # Unknowns are c_n, both parts of f, and how fast each of them gives way.
-    M, plus, minus = np.zeros((k + 3 * s, k + 3 * s)), k + s, k + 2 * s
-    M[:plus, :plus] = K
-    M[:plus, plus:minus] = -K[:, k:]
-    M[plus:minus, :minus] = -M[k:plus, :minus]
+    rows = (p.owner >= 0).nonzero()[0]
+    # Unknowns: c_n, positive and negative parts of f, and absolute sliding rates.
+    M, negative, slip = np.zeros((k + 3 * s, k + 3 * s)), k + s, k + 2 * s
+    M[:negative, :negative] = K
+    M[:negative, negative:slip] = -K[:, k:]
+    M[negative:slip, :slip] = -M[k:negative, :slip]
     i = np.arange(s)
-    M[k + i, minus + i] = M[plus + i, minus + i] = 1.0
-    M[minus + i, k + i] = M[minus + i, plus + i] = -1.0
-    M[minus + held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
+    M[k + i, slip + i] = M[negative + i, slip + i] = 1.0
+    M[slip + i, k + i] = M[slip + i, negative + i] = -1.0
+    M[slip + rows, p.owner[rows]] = p.mu[rows] * s_n[p.owner[rows]] / s_t[rows]
     z, residual = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
-    size = float(np.abs(q).max(initial=0.0)) or 1.0
-    if not residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
+    scale = float(np.abs(q).max(initial=0.0)) or 1.0
+    if not residual <= 1e-8 * max(scale, float((p.bound / s_t).max(initial=0.0))):
         return None
-    return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), residual / size)
+    return evaluate(p, s_n * z[:k], s_t * (z[k:negative] - z[negative:slip]), residual / scale)
 
 
-def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
-    """Rates, signs and friction shares that forces give."""
+def evaluate(
+    problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0
+) -> ContactSolution:
+    """Rates, sliding signs and friction ratios under given forces."""
     p = problem
-    change, size = p.lift * (c_n @ p.G + f @ p.T), np.abs(f)
-    most = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
-    # Friction whose bound is zero by c_n has no margin in either direction.
-    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max(initial=0.0))
-    slides = np.where(f != 0, -f, p.b_t + p.T @ change)
-    sign, shares = np.where(edge, np.sign(slides), 0.0), size / np.maximum(most, 1e-300)
-    return ContactAnswer(c_n, f, p.b_n + p.A @ change, shares, sign, change, residual)
+    change, size = p.inverse_mass * (c_n @ p.G + f @ p.T), np.abs(f)
+    limit = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
+    # A contact without normal force is at its bound.
+    at_bound = limit - size <= FRICTION_MARGIN * np.maximum(limit, 1e-3 * size.max(initial=0.0))
+    slip = np.where(f != 0, -f, p.b_t + p.T @ change)
+    sign, ratios = np.where(at_bound, np.sign(slip), 0.0), size / np.maximum(limit, 1e-300)
+    return ContactSolution(c_n, f, p.b_n + p.A @ change, ratios, sign, change, residual)
 
 
 @lru_cache(maxsize=256)
-def _combine(
+def _list_choices(
     k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None
 ) -> tuple[Array, Flags]:
-    """One choice of modes of k contacts and n coordinates, or all, with up to n conditions.
+    """One `choice` of modes, or all, of k contacts and n coordinates, with at most n conditions.
 
-    Returns which way what may stick gives way, 0 where it does not, (m, s), and which forces are
-    for a condition, (m, k + s). All choices are none if they are too many.
+    Returns sliding signs of contacts and joints at rest, zero if sticking, (m, s), and masks of the
+    forces with a condition, (m, k + s). Empty with more than `MAX_CHOICES` choices.
     """
     owners = np.array(owner, dtype=int)
     options: list[tuple[int, ...]]
-    options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
-    options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
-    every = [] if choice is None else [choice]
-    if choice is None and math.prod(len(option) for option in options) <= MOST:
-        every = list(product(*options))
-    choices = np.array(every, dtype=int).reshape(len(every), len(options))
-    modes = np.empty((len(choices), len(owners)), dtype=int)
-    modes[:, owners >= 0], modes[:, owners < 0] = choices[:, owners[owners >= 0]], choices[:, k:]
-    active = np.hstack([choices[:, :k] != APART, modes == STICKS])
-    sound = active.sum(axis=1) <= n
-    return np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))[sound], active[sound]
+    options = [
+        (SEPARATED, STICKING, POSITIVE, NEGATIVE) if i in owner else (SEPARATED, STICKING)
+        for i in range(k)
+    ]
+    options += [(STICKING, POSITIVE, NEGATIVE) for _ in range(owner.count(-1))]
+    selected = [] if choice is None else [choice]
+    if choice is None and math.prod(len(option) for option in options) <= MAX_CHOICES:
+        selected = list(product(*options))
+    choices = np.array(selected, dtype=int).reshape(len(selected), len(options))
+    mode = np.empty((len(choices), len(owners)), dtype=int)
+    mode[:, owners >= 0], mode[:, owners < 0] = choices[:, owners[owners >= 0]], choices[:, k:]
+    active = np.hstack([choices[:, :k] != SEPARATED, mode == STICKING])
+    mask = active.sum(axis=1) <= n
+    return np.where(mode == POSITIVE, 1.0, np.where(mode == NEGATIVE, -1.0, 0.0))[mask], active[
+        mask
+    ]
 
 
-def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list[ContactAnswer]:
-    """All solutions with distinct rates, or that with the modes `choice` of contacts, then joints.
+def list_solutions(p: ContactProblem, choice: Sequence[int] | None = None) -> list[ContactSolution]:
+    """Solutions with distinct rates, or only the one with modes `choice` of contacts, then joints.
 
-    Enumerates modes; none are listed where these are more than `MOST`.
+    Enumeration of modes; empty with more than `MAX_CHOICES` of them.
     """
     modes = None if choice is None else tuple(choice)
-    ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
+    signs, active = _list_choices(len(p.b_n), len(p.inverse_mass), tuple(p.owner.tolist()), modes)
     s_n, s_t, K, q = p.scaled
     k = len(s_n)
-    # A contact that slides brings its friction with it, what turns has a given one.
-    held = (p.owner >= 0).nonzero()[0]
-    owner, bound = p.owner[held], ways * (p.bound / s_t)
-    rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
-    rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
-    partner[owner] = k + held
-    left, right = K - rubs[:, None, :] * K[:, partner], bound @ K[:, k:].T - q
-    # Forces without a condition are zero, by rows of the unit matrix.
-    left = np.where(active[:, :, None] & active[:, None, :], left, np.eye(len(q)))
-    sound = np.abs(np.linalg.det(left)) > SINGULAR
-    forces = np.linalg.solve(left[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
-    forces[:, k:] -= bound[sound]
-    forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
+    # Friction is proportional to c_n of a sliding contact, and constant in a turning joint.
+    rows = (p.owner >= 0).nonzero()[0]
+    owner, bound = p.owner[rows], signs * (p.bound / s_t)
+    ratios, friction_rows = np.zeros((len(signs), len(q))), np.arange(len(q))
+    ratios[:, owner] = p.mu[rows] * s_n[owner] / s_t[rows] * signs[:, rows]
+    friction_rows[owner] = k + rows
+    lhs, rhs = K - ratios[:, None, :] * K[:, friction_rows], bound @ K[:, k:].T - q
+    # Forces without a condition are zero: rows of the unit matrix.
+    lhs = np.where(active[:, :, None] & active[:, None, :], lhs, np.eye(len(q)))
+    regular = np.abs(np.linalg.det(lhs)) > MIN_DETERMINANT
+    forces = np.linalg.solve(lhs[regular], np.where(active, rhs, 0.0)[regular][:, :, None])[:, :, 0]
+    forces[:, k:] -= bound[regular]
+    forces[:, k + rows] -= ratios[regular][:, owner] * forces[:, owner]
     rates = q + forces @ K.T
-    size = float(np.abs(q).max(initial=0.0)) or 1.0
-    slack = EDGE * size
+    scale = float(np.abs(q).max(initial=0.0)) or 1.0
+    slack = FRICTION_MARGIN * scale
     pair = forces[:, :k], rates[:, :k]
-    obeys = (np.minimum(*pair) >= -slack) & (np.abs(pair[0] * pair[1]) <= slack * size)
-    fine = np.logical_and.reduce(obeys, axis=1)
-    forces, rates = forces[fine], rates[fine]
-    most = np.maximum(forces[:, :k] * s_n, 0.0)
-    most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
+    valid = (np.minimum(*pair) >= -slack) & (np.abs(pair[0] * pair[1]) <= slack * scale)
+    feasible = np.logical_and.reduce(valid, axis=1)
+    forces, rates = forces[feasible], rates[feasible]
+    limit = np.maximum(forces[:, :k] * s_n, 0.0)
+    limit = np.hstack([limit, np.zeros((len(limit), 1))])[:, p.owner] * p.mu + p.bound
     f, r = forces[:, k:], rates[:, k:]
-    spare = most / s_t - np.abs(f)
-    # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
-    opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
-    fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
+    margin = limit / s_t - np.abs(f)
+    # Zero rate, or friction at its bound and opposite to the rate; zero friction has no sign.
+    slides = (margin <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
+    feasible = np.logical_and.reduce((margin >= -slack) & (slides | (np.abs(r) <= slack)), axis=1)
     distinct: list[int] = []
-    for row in fine.nonzero()[0].tolist():
-        if all(np.abs(rates[row] - rates[other]).max() > SAME * size for other in distinct):
+    for row in feasible.nonzero()[0].tolist():
+        if all(np.abs(rates[row] - rates[j]).max() > RATE_TOLERANCE * scale for j in distinct):
             distinct.append(row)
     return [
-        complete(p, np.maximum(s_n * forces[i, :k], 0.0), s_t * forces[i, k:]) for i in distinct
+        evaluate(p, np.maximum(s_n * forces[i, :k], 0.0), s_t * forces[i, k:]) for i in distinct
     ]
 
 
 def solve_lcp(M: Array, q: Array) -> tuple[Array, float]:
-    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one.
+    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M, (n, n), is scaled.
 
-    Complementary pivoting until the artificial unknown z_0 leaves the basis. Returns z, (n,), and
-    the largest violation of these conditions, infinite on a ray.
+    Returns z, (n,), and the largest violation of these conditions, infinite on a ray.
     """
     n = len(q)
     if (q >= 0).all():
         return np.zeros(n), 0.0
     # Columns: the right-hand side, w, z and z_0.
-    table = np.empty((n, 2 * n + 2))
-    table[:, 0], table[:, 1 : n + 1] = q / float(np.abs(q).max()), np.eye(n)
-    table[:, n + 1 : -1], table[:, -1] = -M, -1.0
+    tableau = np.empty((n, 2 * n + 2))
+    tableau[:, 0], tableau[:, 1 : n + 1] = q / float(np.abs(q).max()), np.eye(n)
+    tableau[:, n + 1 : -1], tableau[:, -1] = -M, -1.0
     basis = np.arange(1, n + 1)
-    row, entering = _choose(table, np.arange(n), -np.ones(n)), 2 * n + 1
+    row, entering = _select_row(tableau, np.arange(n), -np.ones(n)), 2 * n + 1
     for _ in range(60 * n):
         leaving = int(basis[row])
-        table[row] /= table[row, entering]
-        factors = table[:, entering].copy()
+        tableau[row] /= tableau[row, entering]
+        factors = tableau[:, entering].copy()
         factors[row] = 0.0
-        table -= factors[:, None] * table[row]
+        tableau -= factors[:, None] * tableau[row]
         basis[row] = entering
         if leaving == 2 * n + 1:
-            # From the original matrix.
-            chosen = basis[basis > n] - n - 1
+            # Solve again with the original matrix.
+            basic = basis[basis > n] - n - 1
             z = np.zeros(n)
-            z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen], rcond=None)[0]
+            z[basic] = np.linalg.lstsq(M[np.ix_(basic, basic)], -q[basic], rcond=None)[0]
             w = M @ z + q
-            residual = max(part.max(initial=0.0) for part in (np.abs(w[chosen]), -z, -w))
+            residual = max(part.max(initial=0.0) for part in (np.abs(w[basic]), -z, -w))
             return np.maximum(z, 0.0), float(residual)
         entering = leaving + n if leaving <= n else leaving - n
-        column = table[:, entering]
-        # Smaller pivots are rounding of redundant rows.
-        rising = (column > 1e-8).nonzero()[0]
-        if not len(rising):
+        column = tableau[:, entering]
+        # Smaller pivots are rounding errors of redundant rows.
+        rows = (column > 1e-8).nonzero()[0]
+        if not len(rows):
             break
-        # The artificial unknown goes as soon as it may: its level is what is missing.
-        ratios = table[rising, 0] / column[rising]
-        low = rising[ratios <= ratios.min() + 1e-12]
-        last = low[basis[low] == 2 * n + 1]
-        row = int(last[0]) if len(last) else _choose(table, rising, column[rising])
+        # Among ties the artificial unknown leaves first: it is the infeasibility.
+        ratios = tableau[rows, 0] / column[rows]
+        ties = rows[ratios <= ratios.min() + 1e-12]
+        z_0 = ties[basis[ties] == 2 * n + 1]
+        row = int(z_0[0]) if len(z_0) else _select_row(tableau, rows, column[rows])
     return np.full(n, np.nan), np.inf
 
 
-def _choose(table: Array, rows: Numbers, pivots: Array) -> int:
-    """Row of the lexicographically least ratio to its pivot; first, of what falls most."""
-    sizes = np.abs(pivots)
-    ratios = table[rows, 0] / sizes
-    least = (ratios == ratios.min()).nonzero()[0]
-    if len(least) > 1:
-        chosen = rows[least]
-        ties = table[chosen, 1 : len(table) + 1] / sizes[least, None]
-        return int(chosen[np.lexsort(ties.T[::-1])[0]])
-    return int(rows[least[0]])
+def _select_row(tableau: Array, rows: Numbers, pivots: Array) -> int:
+    """Pivot row by the lexicographic minimum ratio test among `rows`, (m,), with their pivots."""
+    magnitudes = np.abs(pivots)
+    ratios = tableau[rows, 0] / magnitudes
+    tied = (ratios == ratios.min()).nonzero()[0]
+    if len(tied) > 1:
+        candidates = rows[tied]
+        tie_ratios = tableau[candidates, 1 : len(tableau) + 1] / magnitudes[tied, None]
+        return int(candidates[np.lexsort(tie_ratios.T[::-1])[0]])
+    return int(rows[tied[0]])
 
 
 class StepEnd(NamedTuple):
-    """One end of a step."""
+    """State at one end of a step."""
 
     motion: Array  # (3, n): z, z' and z''
     gaps: Array  # gaps, ranges (N,) [m]: of all pairs
@@ -264,72 +270,72 @@ class StepEnd(NamedTuple):
 
 
 class ClosedContacts:
-    """Pairs that touch and do not part, each constraint once; sliding signs, and what stands."""
+    """Independent closed contacts, their sliding signs, and contacts and joints at rest."""
 
     def __init__(self, system: System, pairs: tuple[int, ...], rows: ContactRows, v: Array) -> None:
         self.system, self.pairs, self.rows, v_t = system, pairs, rows, rows.A_t @ v
         self.mu = system.friction[list(pairs)]
-        rubs = self.mu > 0
-        slow = np.abs(v_t) < STANDING * system.scales.speed
-        self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
-        self.standing = (rubs & slow).nonzero()[0]
-        slow = np.abs(v) < STANDING * system.units[system.n :]
-        self.sigma = np.where((system.dry > 0) & ~slow, np.sign(v), 0.0)
-        self.joints = ((system.dry > 0) & slow).nonzero()[0]
+        frictional = self.mu > 0
+        is_slow = np.abs(v_t) < ZERO_SPEED * system.scales.speed
+        self.Xi = np.where(frictional & ~is_slow, np.sign(v_t), 0.0)
+        self.static = (frictional & is_slow).nonzero()[0]
+        is_slow = np.abs(v) < ZERO_SPEED * system.units[system.n :]
+        self.sigma = np.where((system.dry > 0) & ~is_slow, np.sign(v), 0.0)
+        self.joints = ((system.dry > 0) & is_slow).nonzero()[0]
 
-    def pose_impact(self, v: Array) -> ContactProblem:
-        """Contact problem of velocities: whatever has friction may stick."""
-        at, rubs = self.rows, self.mu.nonzero()[0]
-        T, mu = at.A_t[rubs], self.mu[rubs]
+    def impact_problem(self, v: Array) -> ContactProblem:
+        """Contact problem of an impact at velocity v, (n,): any contact with friction may stick."""
+        rows, frictional = self.rows, self.mu.nonzero()[0]
+        T, mu = rows.A_t[frictional], self.mu[frictional]
         return ContactProblem(
-            1 / self.system.mass, at.A, at.A, at.A @ v, T, T @ v, rubs, mu, 0 * mu
+            1 / self.system.mass, rows.A, rows.A, rows.A @ v, T, T @ v, frictional, mu, 0 * mu
         )
 
-    def pose(self, free: Array, rows: ContactRows) -> ContactProblem:
-        """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
-        system, standing, none = self.system, self.standing, np.zeros(len(self.joints))
-        G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ free + rows.bend
-        T = np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]])
-        b_t = T @ free + np.append(rows.bend_t[standing], none)
-        owner, mu = np.append(standing, none - 1).astype(int), np.append(self.mu[standing], none)
-        bound = np.append(0 * self.mu[standing], system.dry[self.joints])
+    def force_problem(self, a_free: Array, rows: ContactRows) -> ContactProblem:
+        """Contact problem of accelerations; `a_free`, (n,): those without contact forces."""
+        system, static, zeros = self.system, self.static, np.zeros(len(self.joints))
+        G, b_n = rows.A - (self.mu * self.Xi)[:, None] * rows.A_t, rows.A @ a_free + rows.A_dot_v
+        T = np.vstack([rows.A_t[static], np.eye(system.n)[self.joints]])
+        b_t = T @ a_free + np.append(rows.A_t_dot_v[static], zeros)
+        owner, mu = np.append(static, zeros - 1).astype(int), np.append(self.mu[static], zeros)
+        bound = np.append(0 * self.mu[static], system.dry[self.joints])
         return ContactProblem(1 / system.mass, rows.A, G, b_n, T, b_t, owner, mu, bound)
 
-    def recall(self, modes: Modes) -> list[int]:
-        """Modes as `list_answers` has them."""
+    def encode(self, modes: Modes) -> list[int]:
+        """Modes as the `choice` of `list_solutions`."""
         signs = dict(zip(modes.kept, modes.Xi, strict=True))
-        standing = set(self.standing.tolist())
+        static = set(self.static.tolist())
         choice = [
-            MODES[signs[pair] if k in standing else 0.0] if pair in signs else APART
+            MODE_OF_SIGN[signs[pair] if k in static else 0.0] if pair in signs else SEPARATED
             for k, pair in enumerate(self.pairs)
         ]
-        return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
+        return choice + [MODE_OF_SIGN[modes.sigma[joint]] for joint in self.joints]
 
-    def make_modes(self, answer: ContactAnswer, at: ContactRows) -> Modes:
-        """Independent constraints, of rows `at` a state, that give the answer's motion."""
+    def make_modes(self, solution: ContactSolution, state: ContactRows) -> Modes:
+        """Modes with independent constraints, of rows `state`, and the motion of a solution."""
         system, closed = self.system, self.pairs
-        size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
-        still, presses = 1e-3 * SAME * size, answer.c_n > 0
-        order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
-        adds, root = IndependentRows(DEPENDENT).add, np.sqrt(system.mass)
-        A, A_t = at.A / root, at.A_t / root
-        kept = {k for k in order if presses[k] and adds(A[k])}
-        count, held, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()
-        sigma[self.joints] = answer.sign[len(self.standing) :]
-        rows, places = np.vstack([A_t, np.eye(system.n)]), [*self.standing, *(count + self.joints)]
-        # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first:
-        # decisions in the least-time policy of the square do not end else.
-        for j in np.argsort(-answer.shares, kind="stable").tolist():
-            row, sign = int(places[j]), answer.sign[j]
+        scale = max(float(np.abs(solution.r_n).max(initial=0.0)), system.scales.acceleration)
+        r_max, loaded = 1e-3 * RATE_TOLERANCE * scale, solution.c_n > 0
+        order = sorted(range(len(closed)), key=lambda k: -solution.c_n[k])
+        add_row, root_mass = IndependentRows(MIN_SINE).add, np.sqrt(system.mass)
+        A, A_t = state.A / root_mass, state.A_t / root_mass
+        kept = {k for k in order if loaded[k] and add_row(A[k])}
+        count, sticking, Xi, sigma = len(closed), list[int](), self.Xi.copy(), self.sigma.copy()
+        sigma[self.joints] = solution.sign[len(self.static) :]
+        rows, owners = np.vstack([A_t, np.eye(system.n)]), [*self.static, *(count + self.joints)]
+        # Of contacts that stick together, such as a flush edge's, the largest ratio comes first.
+        # Case: the least-time policy of the square, where mode selection does not end otherwise.
+        for j in np.argsort(-solution.ratios, kind="stable").tolist():
+            row, sign = int(owners[j]), solution.sign[j]
             if row in kept:
                 Xi[row] = sign
-            if sign == 0 and (row in kept or row >= count) and adds(rows[row]):
-                held.append(row)
-        # What touches without a force stays, for as long as it needs none.
-        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(A[k])}
+            if sign == 0 and (row in kept or row >= count) and add_row(rows[row]):
+                sticking.append(row)
+        # Contacts without force that do not open remain closed.
+        kept |= {k for k in order if not loaded[k] and solution.r_n[k] <= r_max and add_row(A[k])}
         order = sorted(kept)
-        below = [*order, *range(count, count + system.n)]
-        holders = tuple((below.index(row),) for row in sorted(held))
+        row_order = [*order, *range(count, count + system.n)]
+        holders = tuple((row_order.index(row),) for row in sorted(sticking))
         signs = tuple(Xi[order].tolist()), tuple(sigma.tolist())
         return Modes(tuple(closed[k] for k in order), holders, *signs)
 
@@ -337,14 +343,14 @@ class ClosedContacts:
 class FreeRun(Run):
     """A running simulation without prescribed contacts; other arguments are those of `Run`."""
 
-    resting: bool  # whether everything rests
-    unique: bool  # whether the present modes were certainly the only solution
+    resting: bool  # whether all bodies are at rest
+    unique: bool  # whether the present modes are known to be the only solution
     residual: float  # largest residual of a contact problem so far
-    watched: Flags  # (N,): which pairs do not press
-    level: Array  # (N,) [m]: gap at which a pair that touches closes
-    before: StepEnd
-    after: StepEnd
-    shift = np.zeros(0)  # (m,): how far below zero each event value has to fall
+    monitored: Flags  # (N,): pairs without contact forces
+    closing_gaps: Array  # (N,) [m]: gaps at which touching pairs close
+    step_start: StepEnd
+    step_end: StepEnd
+    shift = np.zeros(0)  # (m,): threshold of each event value below zero
 
     def __init__(
         self,
@@ -360,43 +366,40 @@ class FreeRun(Run):
         self.unit = system.scales.length
         self.resting = self.unique = False
 
-    def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> Outcome:
-        """Simulate until the torques end or `halt`, called at events; how that ends.
-
-        `touching` are gaps to close at the start [m].
-        """
-        system, root = self.system, np.sqrt(self.system.mass)
+    def play(self, max_gap: float, halt: Callable[[FreeRun], bool] | None = None) -> Outcome:
+        """Close gaps below `max_gap` [m]; simulate until `halt` at an event or the torques' end."""
+        system, root_mass = self.system, np.sqrt(self.system.mass)
         for _ in range(5):
-            # Project onto what touches, in the metric of masses.
-            gaps, ranges = system.look(self.z)
-            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
-            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
+            # Project onto the closed contacts, in the metric M.
+            gaps, ranges = system.measure_at(self.z)
+            pairs = np.flatnonzero((np.abs(gaps) < max_gap) & (ranges > -max_gap)).tolist()
+            if np.abs(gaps[pairs]).max(initial=0.0) < 1e-15 * system.scales.length:
                 break
-            rows = system.evaluate(self.z, self.v, near).A / root
-            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
+            rows = system.evaluate(self.z, self.v, pairs).A / root_mass
+            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[pairs], rcond=1e-9)[0] / root_mass
         while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
             if self.t >= self.stop:
                 self.next_piece()
-            closed = self._collide()
-            moved = not self.stands
-            rests = self._decide(closed)
-            if moved and self.stands:
-                rests = self._decide(self._find_closed())
-            if not self.gets_on():
+            closed = self._resolve_impacts()
+            was_moving = not self.is_at_rest
+            at_rest = self._select_modes(closed)
+            if was_moving and self.is_at_rest:
+                at_rest = self._select_modes(self._find_closed())
+            if not self.makes_progress():
                 names = " ".join(self.system.names[pair] for pair in closed.pairs)
                 return self._give_up(f"decisions on {names or 'joints'} do not end")
-            failure = "no motion obeys the laws of contact" if rests is None else ""
-            self.resting = self.resting if rests is None else rests
-            if rests:
+            failure = "no motion obeys the laws of contact" if at_rest is None else ""
+            self.resting = self.resting if at_rest is None else at_rest
+            if at_rest:
                 self.set_velocity(0.0)
-                self._hold()
+                self._wait_at_rest()
             elif not failure:
                 try:
                     self.move()
                 except StuckError:
-                    # Forces grow without bound where the motion jams.
+                    # Forces grow without bound if the motion jams.
                     failure = "steps become too short"
-            if failure and not self._jolt():
+            if failure and not self._apply_frictional_impulse():
                 return self._give_up(failure)
         return Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {self.t:.5g} s")
 
@@ -405,434 +408,433 @@ class FreeRun(Run):
             self.record(still=True)
         return Outcome(OutcomeKind.GIVEN_UP, self.note(EventKind.GIVEN_UP, failure))
 
-    # Instants: impacts and modes.
+    # Events: impacts and modes.
 
     @property
-    def chatter(self) -> float:
-        """Speed of impacts that count as the last one [m/s].
+    def chatter_speed(self) -> float:
+        """Impact speed at and below which a contact stays closed [m/s].
 
-        Fingers may knock an object to and fro for ever, or be knocked so between two bodies: it
-        rises tenfold after 20 and after 40 impacts in a short time, and after every 200: scene 37
-        of seed 5 of the stress study does not end else, with finger 1 reversed from half time on.
+        Impacts between three bodies may not end. The speed rises tenfold after 20 and 40 impacts in
+        a short time, and after every 200. Case: scene 37 of seed 5 of the stress study, with finger
+        1 reversed from half time on.
         """
-        since = self.t - 3e-4 * self.system.scales.time
-        late = takewhile(lambda event: event.time >= since, reversed(self.events))
-        recent = sum(event.kind is EventKind.IMPACT for event in late)
-        # Impacts need no finer steps than these.
-        least = max(CHATTER, 1e3 * self.tolerance)
-        raised = min(recent // 20, 2) + recent // 200
-        return least * self.system.scales.speed * 10.0**raised
+        start = self.t - 3e-4 * self.system.scales.time
+        latest = takewhile(lambda event: event.time >= start, reversed(self.events))
+        count = sum(event.kind is EventKind.IMPACT for event in latest)
+        # Not below the errors of steps.
+        min_speed = max(CHATTER_SPEED, 1e3 * self.tolerance)
+        exponent = min(count // 20, 2) + count // 200
+        return min_speed * self.system.scales.speed * 10.0**exponent
 
     def _is_still(self, acceleration: Array) -> bool:
-        return self.system.is_slower(acceleration * self.system.scales.time, STILL)
+        return self.system.is_slower(acceleration * self.system.scales.time, ZERO_ACCEL)
 
-    def _face(self, z: Array, v: Array) -> tuple[Array, Flags]:
-        """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
+    def _find_facing(self, z: Array, v: Array) -> tuple[Array, Flags]:
+        """Gaps of all pairs at a state [m], and whether they are in range, shape (N,) each."""
         scales = self.system.scales
-        gaps, ranges = self.system.look(z)
-        near = CLOSED * scales.length
-        faces = ranges > near
-        at_end = (ranges > -near) & ~faces
-        if np.count_nonzero(at_end):
-            faces |= at_end & (self.system.look(z + SETTLING * scales.time * v)[1] >= ranges)
+        gaps, ranges = self.system.measure_at(z)
+        tolerance = CLOSED_GAP * scales.length
+        faces = ranges > tolerance
+        edge = (ranges > -tolerance) & ~faces
+        if np.count_nonzero(edge):
+            faces |= edge & (self.system.measure_at(z + EVENT_DELAY * scales.time * v)[1] >= ranges)
         return gaps, faces
 
     def _find_closed(self) -> ClosedContacts:
         system, unit = self.system, self.system.scales.length
-        gaps, faces = self._face(self.z, self.v)
-        near = (gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces
-        touching: list[int] = near.nonzero()[0].tolist()
+        gaps, faces = self._find_facing(self.z, self.v)
+        is_touching = (gaps < CLOSED_GAP * unit) & (gaps > -MAX_OVERLAP * unit) & faces
+        touching: list[int] = is_touching.nonzero()[0].tolist()
         rows = system.evaluate(self.z, self.v, touching)
-        slow = (rows.A @ self.v < self.chatter).tolist()
-        lines = rows.A / np.sqrt(system.mass)
-        lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
-        independent = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
+        is_slow = (rows.A @ self.v < self.chatter_speed).tolist()
+        unit_rows = rows.A / np.sqrt(system.mass)
+        unit_rows /= np.sqrt((unit_rows**2).sum(axis=1))[:, None]
+        independent = (np.abs(unit_rows[:, None] - unit_rows).max(axis=2) > MIN_SINE).tolist()
         chosen: list[int] = []
         for k in sorted(range(len(touching)), key=lambda k: touching[k] not in self.modes.kept):
-            if slow[k] and all(independent[k][j] for j in chosen):
+            if is_slow[k] and all(independent[k][j] for j in chosen):
                 chosen.append(k)
         chosen.sort()
         pairs = tuple(touching[k] for k in chosen)
         rows = ContactRows(*(part[chosen] for part in rows))
         return ClosedContacts(system, pairs, rows, self.v)
 
-    def _collide(self) -> ClosedContacts:
-        """Resolve impacts until no closed gap closes further; what is closed then."""
-        limit = STANDING * self.system.scales.speed
+    def _resolve_impacts(self) -> ClosedContacts:
+        """Compute impacts until no closed gap closes further; returns the closed contacts."""
+        tolerance = ZERO_SPEED * self.system.scales.speed
         # After 30 impacts at one instant the last one is plastic.
         for count in range(31):
             closed = self._find_closed()
             rates = closed.rows.A @ self.v
-            if not (rates < -limit).any():
+            if not (rates < -tolerance).any():
                 return closed
-            self._strike(closed, rates, -rates.min() > self.chatter and count < 30)
+            self._apply_impact(closed, rates, -rates.min() > self.chatter_speed and count < 30)
         return self._find_closed()
 
-    def _strike(self, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
-        answer = solve_problem(closed.pose_impact(self.v))
-        if answer is None:
+    def _apply_impact(self, closed: ClosedContacts, rates: Array, rebounds: bool) -> None:
+        solution = solve_problem(closed.impact_problem(self.v))
+        if solution is None:
             raise ArithmeticError("the plastic impact has no solution")
-        self.residual = max(self.residual, answer.residual)
-        mass, v = self.system.mass, self.v + answer.change
-        if bouncing and self.restitution:
-            # Poisson's expansion, unless it would gain energy.
-            impulse = self.restitution * answer.c_n
-            pushed = v + closed.rows.A.T @ impulse / mass
-            problem = closed.pose_impact(pushed)
-            expands = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
-            after = v if expands is None else pushed + expands.change
-            v = after if after**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
-        pause = 1e-3 * self.system.scales.time
+        self.residual = max(self.residual, solution.residual)
+        mass, v = self.system.mass, self.v + solution.change
+        if rebounds and self.restitution:
+            # Poisson's restitution, unless it adds energy.
+            impulse = self.restitution * solution.c_n
+            v_normal = v + closed.rows.A.T @ impulse / mass
+            problem = closed.impact_problem(v_normal)
+            expansion = solve_problem(replace(problem, bound=problem.mu * impulse[problem.owner]))
+            v_rebound = v if expansion is None else v_normal + expansion.change
+            v = v_rebound if v_rebound**2 @ mass <= self.v**2 @ mass * (1 + 1e-12) else v
+        interval = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
-            if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
+            if rates[k] >= -ZERO_SPEED * self.system.scales.speed or solution.c_n[k] <= 0:
                 continue
             name, text = self.system.names[pair], self.system.structure.pairs[pair].text
             kind, note = EventKind.CHATTER, f"the impacts of {name} come ever closer and are over"
-            if bouncing:
+            if rebounds:
                 kind, note = EventKind.IMPACT, f"{text or name} at {-rates[k]:.4g} m/s"
-            # What chatters may do so again at once.
-            told = (e for e in self.events if e.kind is kind and e.contact == name)
-            if bouncing or all(self.t - e.time >= pause for e in told):
+            # Chatter of a contact is noted once per interval.
+            earlier = (e for e in self.events if e.kind is kind and e.contact == name)
+            if rebounds or all(self.t - e.time >= interval for e in earlier):
                 self.note(kind, note, name, float(-rates[k]))
         self.set_velocity(v)
 
-    def _jolt(self) -> bool:
-        """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
+    def _apply_frictional_impulse(self) -> bool:
+        """Apply an impact without collision (Painleve paradox); returns whether there is one."""
         system = self.system
         closed = self._find_closed()
-        free = system.push(self.v, self.tau(self.t), closed.sigma) / system.mass
-        answer = solve_problem(closed.pose_impact(self.v + SETTLING * system.scales.time * free))
-        if answer is None:
+        a = system.sum_forces(self.v, self.tau(self.t), closed.sigma) / system.mass
+        impact = solve_problem(closed.impact_problem(self.v + EVENT_DELAY * system.scales.time * a))
+        if impact is None:
             return False
-        # With the modes that it ends in, the impact at the instant itself is linear.
-        problem = closed.pose_impact(self.v)
-        exact = list_answers(problem, problem.describe(answer))
-        if not exact or system.is_slower(exact[0].change, STANDING):
+        # The same impact without the delay, in the modes of its solution.
+        problem = closed.impact_problem(self.v)
+        solutions = list_solutions(problem, problem.find_choice(impact))
+        if not solutions or system.is_slower(solutions[0].change, ZERO_SPEED):
             return False
         names = " ".join(system.names[pair] for pair in closed.pairs)
         text = f"no finite forces keep {names} closed: an impact without a collision"
         self.note(EventKind.INCONSISTENT, text, names)
-        self.set_velocity(self.v + exact[0].change)
+        self.set_velocity(self.v + solutions[0].change)
         return True
 
-    def _decide(self, closed: ClosedContacts) -> bool | None:
-        """Set the contact modes; whether everything rests, None where no modes are consistent."""
-        system, lift = self.system, 1 / self.system.mass
-        if (np.abs(closed.rows.A @ self.v) > STANDING * system.scales.speed).any():
-            # What is closed and parts more slowly than chatter is closed at rest, all at once.
+    def _select_modes(self, closed: ClosedContacts) -> bool | None:
+        """Set the contact modes; returns whether all is at rest, None without consistent modes."""
+        system, inverse_mass = self.system, 1 / self.system.mass
+        if (np.abs(closed.rows.A @ self.v) > ZERO_SPEED * system.scales.speed).any():
+            # Closed contacts that open more slowly than `chatter_speed` remain closed.
             pairs, rows = closed.pairs, closed.rows
-            sticks = np.abs(rows.A_t @ self.v) < self.chatter
-            sticks &= closed.mu > 0
-            self.project_velocity(np.vstack([rows.A, rows.A_t[sticks]]))
+            is_slow = np.abs(rows.A_t @ self.v) < self.chatter_speed
+            is_slow &= closed.mu > 0
+            self.project_velocity(np.vstack([rows.A, rows.A_t[is_slow]]))
             rows = system.evaluate(self.z, self.v, pairs)
             closed = ClosedContacts(system, pairs, rows, self.v)
-        later = SETTLING * system.scales.time
-        free = lift * system.push(self.v, self.tau(self.t), closed.sigma)
-        first = self._answer(closed.pose(free, closed.rows), closed.recall(self.modes))
-        if first is None:
+        delay = EVENT_DELAY * system.scales.time
+        a_free = inverse_mass * system.sum_forces(self.v, self.tau(self.t), closed.sigma)
+        present = self._solve(closed.force_problem(a_free, closed.rows), closed.encode(self.modes))
+        if present is None:
             return None
-        acceleration = free + first.change
-        v = self.v + later * acceleration
-        rows = system.evaluate(self.z + later * (self.v + v) / 2, v, closed.pairs)
-        coming = lift * system.push(v, self.tau(self.t + later), closed.sigma)
-        answer = self._choose(closed, closed.pose(coming, rows), coming, first)
-        if answer is None:
+        acceleration = a_free + present.change
+        v = self.v + delay * acceleration
+        rows = system.evaluate(self.z + delay * (self.v + v) / 2, v, closed.pairs)
+        a_later = inverse_mass * system.sum_forces(v, self.tau(self.t + delay), closed.sigma)
+        solution = self._select(closed, closed.force_problem(a_later, rows), a_later, present)
+        if solution is None:
             return None
-        # What rests leaves its last modes by rounding, before it takes others in which it rests.
-        still = self.resting or self._is_still(acceleration)
-        rests = self.stands and still and self._is_still(coming + answer.change)
-        modes = closed.make_modes(answer, rows)
-        self._note_changes(closed.pairs, modes, rests)
+        # At rest the last modes may be left by rounding, for others that are also at rest.
+        is_still = self.resting or self._is_still(acceleration)
+        at_rest = self.is_at_rest and is_still and self._is_still(a_later + solution.change)
+        modes = closed.make_modes(solution, rows)
+        self._note_changes(closed.pairs, modes, at_rest)
         self.modes = modes
-        # Rounding of speeds that are zero.
+        # Remove rounding errors of zero speeds.
         kept = [k for k, pair in enumerate(closed.pairs) if pair in modes.kept]
         joints = np.eye(system.n)[closed.joints]
-        at_rest = [closed.rows.A[kept], closed.rows.A_t[closed.standing], joints]
-        self.project_velocity(np.vstack(at_rest))
-        return rests
+        stationary_rows = [closed.rows.A[kept], closed.rows.A_t[closed.static], joints]
+        self.project_velocity(np.vstack(stationary_rows))
+        return at_rest
 
-    def _answer(self, problem: ContactProblem, *likely: Sequence[int]) -> ContactAnswer | None:
-        """The solution with some likely modes, or another."""
-        for modes in likely:
-            if answers := list_answers(problem, modes):
-                return answers[0]
-        answer = solve_problem(problem)
-        if answer is None:
-            return next(iter(list_answers(problem)), None)
-        self.residual = max(self.residual, answer.residual)
-        return answer
+    def _solve(self, problem: ContactProblem, *choices: Sequence[int]) -> ContactSolution | None:
+        """Solution in the first consistent one of some mode choices, or another one."""
+        for choice in choices:
+            if solutions := list_solutions(problem, choice):
+                return solutions[0]
+        solution = solve_problem(problem)
+        if solution is None:
+            return next(iter(list_solutions(problem)), None)
+        self.residual = max(self.residual, solution.residual)
+        return solution
 
-    def _choose(
-        self, closed: ClosedContacts, problem: ContactProblem, free: Array, before: ContactAnswer
-    ) -> ContactAnswer | None:
-        """The answer nearest to the last one; what rests stays at rest if possible.
+    def _select(
+        self, closed: ClosedContacts, problem: ContactProblem, a_free: Array, guess: ContactSolution
+    ) -> ContactSolution | None:
+        """Solution with the fewest mode changes; rest continues if possible.
 
-        `free` has the accelerations without contacts, shape (n,); `before` is an answer a little
-        earlier.
+        `a_free`, (n,): accelerations without contact forces; `guess`: solution a little earlier.
         """
-        last = closed.recall(self.modes)
-        # There is surely one solution if nothing may stick and K + K^T is positive definite.
+        last = closed.encode(self.modes)
+        # The solution is unique if all contacts slide and K + K^T is positive definite.
         K = problem.scaled[2]
-        slides = not len(problem.b_t)
-        self.unique = slides and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > SINGULAR)
-        answers = [] if self.unique else list_answers(problem)
-        if len(answers) > 1:
-            modes = [problem.describe(answer) for answer in answers]
+        slip = not len(problem.b_t)
+        self.unique = slip and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > MIN_DETERMINANT)
+        solutions = [] if self.unique else list_solutions(problem)
+        if len(solutions) > 1:
+            choices = [problem.find_choice(solution) for solution in solutions]
             if self.modes.kept or len(problem.b_n):
-                self._note_ambiguity(closed, modes)
-            starts = [self.resting and not self._is_still(free + a.change) for a in answers]
-            away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
-            return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
-        likely = last, problem.describe(before)
-        if answers and problem.describe(answers[0]) in likely:
-            return answers[0]
-        return self._answer(problem, *likely)
+                self._note_ambiguity(closed, choices)
+            moves = [self.resting and not self._is_still(a_free + a.change) for a in solutions]
+            count = [sum(a != b for a, b in zip(choice, last, strict=True)) for choice in choices]
+            return solutions[min(range(len(solutions)), key=lambda k: (moves[k], count[k]))]
+        candidates = last, problem.find_choice(guess)
+        if solutions and problem.find_choice(solutions[0]) in candidates:
+            return solutions[0]
+        return self._solve(problem, *candidates)
 
-    def _note_changes(self, closed: Sequence[int], modes: Modes, rests: bool) -> None:
-        if rests and self.resting:
-            # Other forces that hold the same rest are no event.
+    def _note_changes(self, closed: Sequence[int], modes: Modes, at_rest: bool) -> None:
+        if at_rest and self.resting:
+            # Another distribution of forces at rest is no event.
             return
-        system, before = self.system, self.modes
+        system, previous = self.system, self.modes
         names = system.names
-        gone = [pair for pair in before.kept if pair not in modes.kept]
-        new = [pair for pair in modes.kept if pair not in before.kept]
-        near = CLOSED * system.scales.length
-        for pair in gone:
-            gaps, ranges = system.look(self.z)
-            # What still touches, at the end of its range, is a neighbour's from there on.
-            heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
-            if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
-                text = f"{names[pair]} goes on as {names[heirs[0]]}"
-                self.note(EventKind.PASS, text, names[heirs[0]])
-                new.remove(heirs[0])
+        lost = [pair for pair in previous.kept if pair not in modes.kept]
+        gained = [pair for pair in modes.kept if pair not in previous.kept]
+        tolerance = CLOSED_GAP * system.scales.length
+        for pair in lost:
+            gaps, ranges = system.measure_at(self.z)
+            # A closed contact at the end of its range continues on a neighbouring feature.
+            successors = [p for p in gained if names[p][-1:] == names[pair][-1:]]
+            if successors and abs(gaps[pair]) < tolerance and ranges[pair] < tolerance:
+                text = f"{names[pair]} goes on as {names[successors[0]]}"
+                self.note(EventKind.PASS, text, names[successors[0]])
+                gained.remove(successors[0])
             elif pair not in closed or self.records:
                 self.note(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
-        for pair in new if self.records else ():
+        for pair in gained if self.records else ():
             self.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
         if not self.records:
-            before = modes
-        slid = dict(zip(before.kept, before.Xi, strict=True))
+            previous = modes
+        old_signs = dict(zip(previous.kept, previous.Xi, strict=True))
         changes = [
-            (names[pair], slid[pair], Xi, "slides")
+            (names[pair], old_signs[pair], Xi, "slides")
             for pair, Xi in zip(modes.kept, modes.Xi, strict=True)
-            if pair in slid and system.friction[pair] > 0
+            if pair in old_signs and system.friction[pair] > 0
         ]
-        joints = zip(before.sigma, modes.sigma, strict=True)
+        joints = zip(previous.sigma, modes.sigma, strict=True)
         changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
         for name, old, now, verb in changes:
             if old != now:
                 self.note(*describe_change(name, old, now, verb), name)
-        if rests:
+        if at_rest:
             self.note(EventKind.REST, "everything rests")
         elif self.resting:
             self.note(EventKind.START, "the motion begins")
 
-    def _note_ambiguity(self, closed: ClosedContacts, answers: Sequence[Sequence[int]]) -> None:
-        """Record that there are several answers, once for each set of contacts."""
+    def _note_ambiguity(self, closed: ClosedContacts, choices: Sequence[Sequence[int]]) -> None:
+        """Record that there are several solutions, once for each set of contacts."""
         names = [self.system.names[pair] for pair in closed.pairs]
-        slides = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
-        turns = {STICKS: "is held", FORTH: "turns +", BACK: "turns -"}
-        told = [(name, slides) for name in names]
-        for k in closed.standing.tolist():
-            told[k] = names[k], slides | {STICKS: "sticks"}
-        told += [(_name(self.system, joint), turns) for joint in closed.joints.tolist()]
-        differs = [len(set(modes)) > 1 for modes in zip(*answers, strict=True)]
+        contact_texts = {
+            SEPARATED: "parts",
+            STICKING: "presses",
+            POSITIVE: "slides +",
+            NEGATIVE: "slides -",
+        }
+        joint_texts = {STICKING: "is held", POSITIVE: "turns +", NEGATIVE: "turns -"}
+        labels = [(name, contact_texts) for name in names]
+        for k in closed.static.tolist():
+            labels[k] = names[k], contact_texts | {STICKING: "sticks"}
+        labels += [(_name(self.system, joint), joint_texts) for joint in closed.joints.tolist()]
+        differs = [len(set(modes)) > 1 for modes in zip(*choices, strict=True)]
         texts = []
-        for answer in answers:
-            modes = zip(told, answer, differs, strict=True)
+        for choice in choices:
+            modes = zip(labels, choice, differs, strict=True)
             parts = [f"{name} {words[mode]}" for (name, words), mode, other in modes if other]
             texts.append(", ".join(parts) or "the rest accelerates otherwise")
-        text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed"
+        text = f"{len(choices)} motions are possible with {', '.join(names) or 'no contact'} closed"
         text += f" ({'; or '.join(texts)})"
-        last = [event for event in self.events if event.kind is EventKind.AMBIGUOUS]
-        if not last or last[-1].text.split(" at t =")[0] != text:
+        earlier = [event for event in self.events if event.kind is EventKind.AMBIGUOUS]
+        if not earlier or earlier[-1].text.split(" at t =")[0] != text:
             self.note(EventKind.AMBIGUOUS, text, " ".join(names))
 
     # Rest.
 
-    def _hold(self) -> None:
-        """Let time pass at rest until forces leave their bounds, or the torques end."""
+    def _wait_at_rest(self) -> None:
+        """Advance time at rest until forces leave their bounds, or the torques end."""
         self.record(still=True)
-        decided = True
+        at_rest = True
         while True:
-            breach = find_breach(self._list_margins(decided), self.fraction(self.t))
-            decided = False
+            breach = find_breach(self._list_margins(at_rest), self.fraction(self.t))
+            at_rest = False
             self.wait(self.time(breach) if breach < 1 else self.stop)
             if breach < 1 or not self.next_piece():
                 return
 
-    def _list_margins(self, decided: bool) -> Array:
-        """Margins at rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1), scaled.
+    def _list_margins(self, at_rest: bool) -> Array:
+        """Scaled margins of rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1).
 
-        All are affine in the torques: they follow from the steps' forces under three torques. Where
-        it is `decided` that everything rests at present, accelerations and breaches are rounding.
+        All are affine in the torques, and computed from the forces under three torques. If the
+        object is known to be `at_rest`, present accelerations and violations count as rounding.
         """
         self.load(self.modes)
-        s, torque, seen = self.s, self.s.inputs.torque, []
+        s, torque, samples = self.s, self.s.inputs.torque, []
         for tau in np.vstack([np.zeros(2), self.system.scales.torque * np.eye(2)]):
             torque[:] = 0.0
             torque[:: self.torque.coefficients.shape[2]] = tau
-            s.look()
+            s.evaluate_state()
             rates = s.outputs.acceleration * self.system.scales.time
             margins = s.outputs.values[: s.rows.cone.stop]
-            seen.append(np.concatenate([margins, rates / self.system.units[self.system.n :]]))
-        slopes = np.array([part - seen[0] for part in seen[1:]]).T / self.system.scales.torque
+            samples.append(np.concatenate([margins, rates / self.system.units[self.system.n :]]))
+        slopes = np.array([part - samples[0] for part in samples[1:]]).T / self.system.scales.torque
         values = slopes @ self.torque.coefficients[self.piece]
-        values[:, 0] += seen[0]
+        values[:, 0] += samples[0]
         count = s.rows.cone.stop
         margins, rates = values[:count], values[count:]
-        creeps = np.vstack([-rates, rates])
-        powers = self.fraction(self.t) ** np.arange(values.shape[1]) * decided
-        # Contacts are nearly dependent where two fingers come to rest on each other, or where the
-        # only one that sticks hardly moves with the hand (hexagon with v0 below finger 2's joint).
+        rate_margins = np.vstack([-rates, rates])
+        powers = self.fraction(self.t) ** np.arange(values.shape[1]) * at_rest
+        # Contacts may be nearly dependent. Cases: two fingers that rest on each other; hexagon with
+        # v0 below finger 2's joint.
         margins[:, 0] += np.maximum(ROUNDING_FORCE, -2 * margins @ powers)
-        creeps[:, 0] += np.maximum(10 * STILL, 2 * np.abs(creeps @ powers))
-        return np.vstack([margins, creeps])
+        rate_margins[:, 0] += np.maximum(10 * ZERO_ACCEL, 2 * np.abs(rate_margins @ powers))
+        return np.vstack([margins, rate_margins])
 
     # Motion.
 
     def move(self) -> None:
         """Integrate with the present modes until an event, or until the torques step or end."""
         self.load(self.modes)
-        rows, self.kept = self.s.rows, list(self.modes.kept)
-        self.watched = ~np.isin(range(len(self.system.names)), self.kept)
-        self.counts = [rows.cone.stop, rows.turn.stop - rows.cone.stop, len(self.kept)]
-        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], self.counts)
-        self.look()
-        # What touches already may sink by rounding; what is behind something else never closes.
-        gaps = self.after.gaps
-        sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
-        self.level = np.where(gaps > -SUNK * self.unit, sunk, -np.inf)
-        # Values that start below zero may stay there: modes are judged a moment later.
+        slices, self.kept = self.s.rows, list(self.modes.kept)
+        self.monitored = ~np.isin(range(len(self.system.names)), self.kept)
+        self.counts = [slices.cone.stop, slices.turn.stop - slices.cone.stop, len(self.kept)]
+        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED_GAP], self.counts)
+        self.evaluate_state()
+        # Touching pairs may overlap by rounding; pairs with a larger overlap never close.
+        gaps = self.step_end.gaps
+        levels = np.minimum(gaps, 0.0) - 0.5 * CLOSED_GAP * self.unit
+        self.closing_gaps = np.where(gaps > -MAX_OVERLAP * self.unit, levels, -np.inf)
+        # Values may start below zero, as modes are selected a short time later.
         self.shift = np.maximum(self.slack, self.slack - self.values)
-        near = self.watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
-        if near.any():
-            # Half the time in which the nearest pair that has just parted would close again. What
-            # parts more slowly was closed when the modes were chosen.
-            at = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
-            rate, bend = at.A @ self.v, at.A @ self.s.outputs.acceleration + at.bend
-            back = (rate >= self.chatter) & (bend < 0)
-            self.h = float((-rate[back] / bend[back]).min(initial=self.h))
+        is_near = self.monitored & (gaps <= MIN_GAP * self.unit) & (gaps > -CLOSED_GAP * self.unit)
+        if is_near.any():
+            # Half the time after which a pair that has just opened closes; slower ones are closed.
+            rows = self.system.evaluate(self.z, self.v, is_near.nonzero()[0].tolist())
+            rate, growth = rows.A @ self.v, rows.A @ self.s.outputs.acceleration + rows.A_dot_v
+            closing = (rate >= self.chatter_speed) & (growth < 0)
+            self.h = float((-rate[closing] / growth[closing]).min(initial=self.h))
         self.record()
         super().move()
 
     def begin_step(self) -> None:
-        """Start the next step, of `REACH` at most, from the end of the one just made."""
+        """Start the next step, of at most `MAX_STEP`, from the end of the last one."""
         super().begin_step()
-        self.before = self.after
+        self.step_start = self.step_end
         self.shift = np.where(self.values > 0, self.slack, self.shift)
-        _, speed, push = np.abs(self.after.motion / self.system.units[: self.system.n]).max(axis=1)
-        root = math.sqrt(speed**2 + 2 * push * REACH)
-        self.longest = float(2 * REACH / (speed + root + 1e-300))
+        _, speed, a = np.abs(self.step_end.motion / self.system.units[: self.system.n]).max(axis=1)
+        end_speed = math.sqrt(speed**2 + 2 * a * MAX_STEP)
+        self.longest = float(2 * MAX_STEP / (speed + end_speed + 1e-300))
 
     def measure(self) -> Array:
         """Event values of the steps, then ranges of kept pairs."""
-        out = self.s.outputs
-        motion = np.concatenate([out.y[: 2 * self.system.n], out.acceleration])
+        outputs = self.s.outputs
+        motion = np.concatenate([outputs.y[: 2 * self.system.n], outputs.acceleration])
         motion = motion.reshape(3, self.system.n)
-        self.after = StepEnd(motion, *self.system.look(motion[0]))
-        return np.concatenate([out.values, self.after.ranges[self.kept] / self.unit])
+        self.step_end = StepEnd(motion, *self.system.measure_at(motion[0]))
+        return np.concatenate([outputs.values, self.step_end.ranges[self.kept] / self.unit])
 
     def pass_break(self) -> bool | None:
-        """Go on to the next piece of the torques; the motion ends if they end or modes change."""
+        """Enter the next piece of the torques; True if they end or modes may change."""
         if not self.next_piece():
             return True
         if self.steps_at[self.piece]:
-            self.look()
-            if not self._holds():
+            self.evaluate_state()
+            if not self._modes_persist():
                 return True
             self.record()
         return None
 
-    def _holds(self) -> bool:
-        """Whether the modes are the only solution after a torque step, by more than rounding."""
-        modes, rows, at = self.s.modes, self.s.rows, self.after
+    def _modes_persist(self) -> bool:
+        """Whether the modes are the unique solution after a torque step, with clear margins."""
+        modes, rows, state = self.s.modes, self.s.rows, self.step_end
         if not self.unique or modes.holders:
             return False
-        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], self.counts)
-        # What has no direction has no speed that could reverse.
+        min_values = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED_GAP], self.counts)
+        # Zero signs have no speed that could reverse.
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
-        clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
-        near = CLOSED * self.unit
-        touches = (np.abs(at.gaps) < near) & (at.ranges > -near) & self.watched
-        return bool((self.values > clear).all()) and not touches.any()
+        min_values[rows.slide.start : rows.turn.stop][signs == 0] = -1
+        tolerance = CLOSED_GAP * self.unit
+        touching = (np.abs(state.gaps) < tolerance) & (state.ranges > -tolerance) & self.monitored
+        return bool((self.values > min_values).all()) and not touching.any()
 
     def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
-        """The first pair that closes within the step just made, but those `done`, and when.
-
-        Pairs that do not face each other there do not count.
-        """
-        n, passed = self.system.n, [pair for pair in done if pair >= 0]
-        while bracket := self._find_bracket(h, passed):
+        """First pair in range that closes within the last step, not in `done`, and its time [s]."""
+        n, excluded = self.system.n, [pair for pair in done if pair >= 0]
+        while bracket := self._find_bracket(h, excluded):
             pair, level, left, right = bracket
 
             def value(step: float, pair: int = pair, level: float = level) -> float:
                 self.step_to(step)
-                return float(self.after.gaps[pair]) - level
+                return float(self.step_end.gaps[pair]) - level
 
-            first = value(left) if left > 0 else float(self.before.gaps[pair]) - level
+            first = value(left) if left > 0 else float(self.step_start.gaps[pair]) - level
             last = value(right)
             if last >= 0 and right < h:
-                # The bracket is that of an interpolation, which grazing may mislead.
+                # The interpolated bracket may be wrong for a grazing contact.
                 right, last = h, value(h)
             if last < 0:
-                # Some ten roundings of the gap count as closed.
+                # Tolerance: about ten rounding errors of the gap.
                 root = find_root(value, left, right, (first, last), self.near, 1e-14 * self.unit)
                 self.step_to(root)
                 y = self.s.outputs.y
-                if self._face(y[:n], y[n : 2 * n])[1][pair]:
+                if self._find_facing(y[:n], y[n : 2 * n])[1][pair]:
                     return pair, root
-            passed.append(pair)
+            excluded.append(pair)
             self.step_to(h)
         return None
 
     def _find_bracket(
-        self, h: float, passed: Sequence[int]
+        self, h: float, excluded: Sequence[int]
     ) -> tuple[int, float, float, float] | None:
-        """The first pair whose gap falls below a level [m], that, and a bracket of when [s]."""
-        unit, start, end = self.unit, self.before, self.after
+        """First pair whose gap falls below a level, this level [m], and a bracket of the time."""
+        unit, start, end = self.unit, self.step_start, self.step_end
         z, v, _ = np.abs(end.motion - start.motion)
         travel = float(((z + h * v) / self.system.units[: self.system.n]).max())
-        count = 1 + int(LOOKS * min(1.0, travel / REACH))
+        count = 1 + int(GAP_SAMPLES * min(1.0, travel / MAX_STEP))
         times = h * np.arange(count + 1) / count
-        seen = [start.gaps, end.gaps], [start.ranges, end.ranges]
+        samples = [start.gaps, end.gaps], [start.ranges, end.ranges]
         if count > 1:
             knots = tuple(np.stack([start.motion, end.motion], axis=1))
             first = np.zeros(count - 1, dtype=np.int64)
             z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
-            seen[0][1:1], seen[1][1:1] = self.system.measure(z)
-        gaps, ranges = map(np.array, seen)
-        # What comes apart within the step may close again within it.
-        apart = np.logical_or.accumulate(gaps[:-1] > ARMED * unit, axis=0)
-        level = np.where(apart, 0.0, self.level)
-        crosses = (gaps[1:] < level) & (gaps[:-1] >= level) & self.watched
-        crosses[:, passed] = False
+            samples[0][1:1], samples[1][1:1] = self.system.measure(z)
+        gaps, ranges = map(np.array, samples)
+        # A pair that opens within the step may close again within it.
+        separated = np.logical_or.accumulate(gaps[:-1] > MIN_GAP * unit, axis=0)
+        level = np.where(separated, 0.0, self.closing_gaps)
+        crosses = (gaps[1:] < level) & (gaps[:-1] >= level) & self.monitored
+        crosses[:, excluded] = False
         crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * unit
         rows, pairs = crosses.nonzero()
         if len(rows):
             row, pair = int(rows[0]), int(pairs[0])
             return pair, float(level[row, pair]), *times[row : row + 2].tolist()
-        # The first one that comes into range apart or touching, and overlaps after that. Out of
-        # range a gap has no meaning and may be negative throughout.
-        turns = (ranges[1:] > 0) & (ranges[:-1] <= 0) & self.watched
-        turns &= (gaps[1:] < -CLOSED * unit) & (gaps[1:] > -REACH * unit)
-        turns[:, passed] = False
-        for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
+        # Otherwise the first pair that enters its range and overlaps; gaps out of range are void.
+        enters = (ranges[1:] > 0) & (ranges[:-1] <= 0) & self.monitored
+        enters &= (gaps[1:] < -CLOSED_GAP * unit) & (gaps[1:] > -MAX_STEP * unit)
+        enters[:, excluded] = False
+        for row, pair in zip(*(part.tolist() for part in enters.nonzero()), strict=True):
             left, right = times[row : row + 2].tolist()
 
             def outside(step: float, pair: int = pair) -> float:
                 self.step_to(step)
-                return -float(self.after.ranges[pair])
+                return -float(self.step_end.ranges[pair])
 
-            # When the pair comes into range.
+            # Time at which the pair comes into range.
             ends, entry = (-float(ranges[row, pair]), outside(right)), right
             if ends[1] < 0 <= ends[0]:
-                flat = CLOSED * unit
-                entry = find_root(outside, left, right, ends, self.near, flat)
+                tolerance = CLOSED_GAP * unit
+                entry = find_root(outside, left, right, ends, self.near, tolerance)
             self.step_to(entry)
-            gap = float(self.after.gaps[pair])
-            if gap > -SUNK * unit:
-                return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
+            gap = float(self.step_end.gaps[pair])
+            if gap > -MAX_OVERLAP * unit:
+                return pair, min(gap, 0.0) - 0.5 * CLOSED_GAP * unit, entry, right
             self.step_to(h)
         return None
 

@@ -21,8 +21,8 @@ close the contact and then hold all touching contacts at rest have to
 
 * be in static balance with all touching contacts, with every c_n at least epsilon and
   |c_t| <= mu (c_n - epsilon), and start no motion that opens one of them;
-* accelerate the formation from rest towards the contact while its gap is open, beyond what friction
-  can hold.
+* accelerate the formation from rest towards the contact while its gap is open, against friction at
+  rest.
 
 All conditions are affine in the torques. The largest minimum of their margins, each relative to its
 saturation value, is a linear programme in three unknowns. Contacts of the formation may open
@@ -50,7 +50,7 @@ from ..mechanics.dynamics import close_all, solve_min_norm
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..problem.definition import Phase, Problem
-from .system import ROUNDING_FORCE, STILL, ContactRows, Modes, build_system
+from .system import ROUNDING_FORCE, ZERO_ACCEL, ContactRows, Modes, build_system
 
 _JOINTS = np.eye(5)[3:]  # rows that give the rates of the joints from z'
 
@@ -64,7 +64,7 @@ class Unit(NamedTuple):
 
 @lru_cache(maxsize=64)
 def list_units(formation: Formation) -> tuple[Unit, ...]:
-    """Units that may slide or turn, contacts first; none flush with a rolling contact."""
+    """Units that may slide or turn, contacts first, except those flush with a rolling contact."""
     friction = np.concatenate([formation.friction, formation.scene.dry[3:]])
     groups = dict.fromkeys(formation.turn_with(row) for row in range(len(friction)))
     return tuple(
@@ -76,10 +76,10 @@ def list_units(formation: Formation) -> tuple[Unit, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Contact mode of a formation: what rolls, sticks or is held, and signs of the others."""
+    """Contact mode of a formation: rolling, sticking and held units, and signs of the others."""
 
     formation: Formation
-    signs: Array  # (n_c + 2,): of sliding and turning, zero for what is held or rolls
+    signs: Array  # (n_c + 2,): of sliding velocities and joint rates, zero if rolling or held
     holders: tuple[tuple[int, ...], ...]  # rows of `signs` held by each force after c_n
 
     @cached_property
@@ -88,7 +88,7 @@ class Mode:
         return self.formation.n_contacts + len(self.holders)
 
     @property
-    def held(self) -> list[int]:
+    def first_rows(self) -> list[int]:
         """First row of each contact, flush edge or joint that rolls, sticks or is held."""
         return [rows[0] for rows in self.holders]
 
@@ -106,10 +106,10 @@ class Mode:
 
 def find_mode(formation: Formation, signs: Array) -> Mode:
     """Mode with sticking where `signs`, (n_c + 2,), are zero; with one freedom none sticks."""
-    held: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
+    holders: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
     if formation.n_constraints < 4:
-        held += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
-    return Mode(formation, signs, tuple(sorted(held)))
+        holders += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
+    return Mode(formation, signs, tuple(sorted(holders)))
 
 
 def list_modes(
@@ -139,10 +139,12 @@ def _list_pairs(formation: Formation) -> tuple[int, ...]:
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:
     """Constraint rows of a formation at one state, with its contacts closed.
 
-    Rows of sliding, A_t (n_c + 2, 5) and bend_t (n_c + 2,), include the joints after the contacts.
+    A_t, (n_c + 2, 5), and A_t_dot_v, (n_c + 2,), have rows of the contacts, then of the joints.
     """
     rows = build_system(formation.scene).evaluate(z, v, _list_pairs(formation))
-    return rows._replace(A_t=np.vstack([rows.A_t, _JOINTS]), bend_t=np.append(rows.bend_t, [0, 0]))
+    return rows._replace(
+        A_t=np.vstack([rows.A_t, _JOINTS]), A_t_dot_v=np.append(rows.A_t_dot_v, [0, 0])
+    )
 
 
 class Response(NamedTuple):
@@ -185,9 +187,9 @@ class Response(NamedTuple):
 
 def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
     """Solve the equations of motion at velocity v, (5,); None for dependent constraints."""
-    scene, count, held = mode.formation.scene, mode.formation.n_contacts, mode.held
+    scene, count, first_rows = mode.formation.scene, mode.formation.n_contacts, mode.first_rows
     slip_rows = (mode.formation.sliding_friction * mode.signs[:count])[:, None] * rows.A_t[:count]
-    P, G = (np.vstack([part, rows.A_t[held]]) for part in (rows.A, rows.A - slip_rows))
+    P, G = (np.vstack([part, rows.A_t[first_rows]]) for part in (rows.A, rows.A - slip_rows))
     inverse_mass = 1 / scene.mass_diagonal
     if mode.n_constraints > mode.formation.n_constraints:
         unit_rows = P * np.sqrt(inverse_mass)
@@ -204,18 +206,18 @@ def respond(mode: Mode, rows: ContactRows, v: Array) -> Response | None:
     c = np.zeros((len(P), 3))
     if abs(ratio) > 1e-12:
         rhs = -PM @ applied
-        rhs[:, 0] -= np.append(rows.bend, rows.bend_t[held])
+        rhs[:, 0] -= np.append(rows.A_dot_v, rows.A_t_dot_v[first_rows])
         c = np.asarray(np.linalg.solve(K, rhs), dtype=float)
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = rows.A_t @ acceleration
-    rates[:, 0] += rows.bend_t
+    rates[:, 0] += rows.A_t_dot_v
     return Response(mode, c, acceleration, rates, ratio)
 
 
 def find_fixed(mode: Mode, rows: ContactRows) -> Flags:
     """Whether a mode fixes each contact, then joint, (n_c + 2,)."""
     root_mass = np.sqrt(mode.formation.scene.mass_diagonal)
-    P, A_t = np.vstack([rows.A, rows.A_t[mode.held]]) / root_mass, rows.A_t / root_mass
+    P, A_t = np.vstack([rows.A, rows.A_t[mode.first_rows]]) / root_mass, rows.A_t / root_mass
     length = np.linalg.norm(A_t, axis=1)
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     return np.asarray(np.linalg.norm(A_t - (A_t @ basis.T) @ basis, axis=1) < 1e-7 * length)
@@ -264,7 +266,7 @@ class StartMode(NamedTuple):
         load = np.array([1.0, *tau])
         return (
             self.response.ratio > 0
-            and self.drive(tau) > STILL * self.rest.unit
+            and self.drive(tau) > ZERO_ACCEL * self.rest.unit
             and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
             and self.rest.opens(self.response.acceleration @ load)
         )
@@ -350,7 +352,7 @@ class Rest(Statics):
         kinematics = self.formation.evaluate(self.z[None], heading[None])
         acceleration = -solve_min_norm(kinematics.P, kinematics.P_dot_v, scene.mass_diagonal)[0]
         rows = evaluate_rows(self.formation, self.z, heading)
-        rate_changes = 1e-5 * time * (rows.A_t @ acceleration + rows.bend_t)
+        rate_changes = 1e-5 * time * (rows.A_t @ acceleration + rows.A_t_dot_v)
         rates = np.outer([1.0, -1.0], rows.A_t @ heading) + rate_changes
         rates[:, list(self.formation.rolling_rows)] = 0.0
         return np.sign(np.where(np.abs(rates) > 1e-12 * units, rates, 0.0))
@@ -371,11 +373,11 @@ class Rest(Statics):
         openings = self.opening[0] @ response.acceleration / scales.acceleration
         openings += GRAZE * slips.sum(axis=0)
         # Difference quotients have errors of 1e-7.
-        slip_slack, gap_slack = STILL, 1e-7
+        slip_slack, gap_slack = ZERO_ACCEL, 1e-7
         if heading is not None:
             # All accelerations are multiples of this one.
             slips = (heading * mass @ response.acceleration)[None] / self.unit
-            slip_slack, gap_slack = -STILL, 0.0
+            slip_slack, gap_slack = -ZERO_ACCEL, 0.0
         margins = np.vstack([limits[planned], slips, limits[~planned], openings])
         sizes = [planned.sum(), len(slips), (~planned).sum(), len(openings)]
         margins[:, 0] += np.repeat([ROUNDING_FORCE, slip_slack, ROUNDING_FORCE, gap_slack], sizes)
@@ -410,7 +412,7 @@ class Rest(Statics):
                 break
             modes = [start_modes[k] for k in np.flatnonzero(is_consistent)]
             for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
-                if mode.drive(tau) > 1e3 * STILL * self.unit and mode.moves(tau):
+                if mode.drive(tau) > 1e3 * ZERO_ACCEL * self.unit and mode.moves(tau):
                     return mode.depart(start, tau)
         return self._collapse(coefficients, loss) if loss <= 1 else None
 
@@ -491,8 +493,8 @@ SATURATION = 0.1  # saturation of margins, over the scene's units
 # Largest delay of a start after the loss of balance, in half pieces of torques, as accelerations
 # have to exceed rounding. Case: phase 1 of query 50 with limited rates.
 START_DELAY = 1e-6
-DRIVE = 0.02  # smallest closing acceleration, over the scene's
-_SMALL = 1e-9  # relative opening rate that counts as zero
+A_MIN = 0.02  # smallest closing acceleration, over the scene's
+ZERO_RATE = 1e-9  # relative opening rate that counts as zero
 
 
 class Standstill(NamedTuple):
@@ -514,8 +516,8 @@ def find_standstill(problem: Problem, phase: Phase, z: Array) -> Standstill:
     contacts = list(phase.formation.add(gained).contacts)
     contacts += [contact for phase_after in following for contact in phase_after.formation.contacts]
     system = build_system(problem.scene)
-    inside = dict(zip(system.names, system.look(z)[1].tolist(), strict=True))
-    touching = [c for c in dict.fromkeys(contacts) if inside[c.name] > -problem.scene.touching]
+    margins = dict(zip(system.names, system.measure_at(z)[1].tolist(), strict=True))
+    touching = [c for c in dict.fromkeys(contacts) if margins[c.name] > -problem.scene.touching]
     return Standstill(z, phase.formation, gained, Formation(problem.scene, tuple(touching)))
 
 
@@ -535,7 +537,7 @@ def find_hold(stop: Standstill, epsilon: float, gap: float) -> Hold | None:
     """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
     A gained contact, open by up to `gap` [m], is closed with an acceleration of at least
-    `DRIVE` if torques for it exist.
+    `A_MIN` if torques for it exist.
     """
     holding_rows = _build_holding_rows(stop, epsilon)
     best = maximise_margin(stop.formation.scene.torque_limit, holding_rows)
@@ -557,7 +559,7 @@ def _build_holding_rows(stop: Standstill, epsilon: float) -> Array:
         rows += [
             -mode.slips / SATURATION
             for mode in _list_sliding(Formation(scene, subset), stop.z)
-            if mode.heading is not None and (statics.A[others] @ mode.heading >= -_SMALL).all()
+            if mode.heading is not None and (statics.A[others] @ mode.heading >= -ZERO_RATE).all()
         ]
     return np.vstack(rows)
 
@@ -594,10 +596,10 @@ def _find_closing(stop: Standstill, holding_rows: Array, opening: Array, gap: fl
     for mode in _list_sliding(stop.formation, z):
         rows, closing = holding_rows, -normal @ mode.response.acceleration
         if mode.heading is None:
-            rows = np.vstack([holding_rows, mode.slips[mode.response.mode.signs != 0] / DRIVE])
+            rows = np.vstack([holding_rows, mode.slips[mode.response.mode.signs != 0] / A_MIN])
         elif normal @ mode.heading >= 0:
             continue
-        closing_bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
+        closing_bound = closing - [A_MIN * scales.acceleration, 0.0, 0.0]
         solution = maximise_margin(scene.torque_limit, rows, closing_bound[None])
         if solution is None or solution[1] < max(MIN_MARGIN, best.margin if best else 0.0):
             continue

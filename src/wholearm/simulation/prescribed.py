@@ -49,14 +49,14 @@ from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .run import Run, StuckError
 from .system import (
     ARRIVAL,
+    EVENT_DELAY,
     FIRST_STEP,
     INNER_STAGES,
-    NODES,
     REST_SPEED,
     REST_WINDOW,
     ROUNDING_FORCE,
-    SETTLING,
-    STANDING,
+    STAGE_TIMES,
+    ZERO_SPEED,
     build_system,
 )
 
@@ -71,8 +71,7 @@ _OUTCOMES = {
     ViolationKind.HELD: OutcomeKind.HELD,
 }
 
-
-_STAGES = np.array([0.0, *(NODES[stage] for stage in INNER_STAGES), 1.0])[:, None]
+_STAGES = np.array([0.0, *(STAGE_TIMES[stage] for stage in INNER_STAGES), 1.0])[:, None]
 _POWERS, _CHEBYSHEV = np.arange(len(_STAGES)), (1 - np.cos(np.pi * np.arange(17) / 16)) / 2
 _INTERPOLATION = _CHEBYSHEV[:, None] ** _POWERS @ np.linalg.inv(_STAGES**_POWERS)
 """Interpolation from `INNER_STAGES` and the ends of a step to its Chebyshev points."""
@@ -129,11 +128,11 @@ class Replay(Run):
     """A running simulation with the contact formations of a problem."""
 
     minima: bool  # whether to record minima of margins within steps
-    settling: float  # settling, rest_window [s], rounding [N]: see the constants of these names
+    delay: float  # delay, rest_window [s], rounding [N]: see the constants of these names
     rest_window: float
     rounding: float
     phase: Phase
-    next_phase: Phase | None  # the next phase
+    next_phase: Phase | None  # None in the last phase
     ends: PhaseEnds  # ends of the phase
     distance: float  # distance to the end of the phase [m or rad]
     rate: float  # time derivative of `distance`
@@ -157,10 +156,10 @@ class Replay(Run):
         system = build_system(problem.scene)
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, times)
         self.problem, self.minima, time = problem, minima, system.scales.time
-        self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
+        self.delay, self.rest_window = EVENT_DELAY * time, REST_WINDOW * time
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        self.hold_end = self.settling_end = -math.inf
+        self.hold_end = self.grace_end = -math.inf
         self.distance = self.rate = 0.0
         self.passable = self.in_motion = False
         self.stuck, self.slip_signs = set(), {}
@@ -200,16 +199,16 @@ class Replay(Run):
         phase; speed along the heading, in the metric M5. The last value is 1 with several degrees
         of freedom, as contacts and joints then come to rest one by one.
         """
-        out, ends, scales = self.s.outputs, self.ends, self.system.scales
-        ends.state[:] = out.y[:10]
+        outputs, ends, scales = self.s.outputs, self.ends, self.system.scales
+        ends.state[:] = outputs.y[:10]
         ends.evaluate()
         self.distance, self.rate = ends.values[-2:].tolist()
         speed = 1.0
         if self.mode.n_constraints >= 4:
-            size = float(self.heading @ (self.system.mass * out.y[5:10]))
+            size = float(self.heading @ (self.system.mass * outputs.y[5:10]))
             speed = size / (scales.speed * scales.mass**0.5)
         # Values of the object's coordinates, between these, are zero.
-        contacts, joints = out.values[: self.s.rows.slide.stop], out.values[-2:]
+        contacts, joints = outputs.values[: self.s.rows.slide.stop], outputs.values[-2:]
         end_values = self.distance / ends.unit, speed
         return np.concatenate([contacts, joints, ends.values[:-2] / scales.length, end_values])
 
@@ -218,9 +217,9 @@ class Replay(Run):
         """Event thresholds: values that start within rounding of zero have to fall below it."""
         return np.where(self.start > self.slack, 0.0, self.slack)
 
-    def observe(self) -> None:
-        """Evaluate the present state, and record it."""
-        self.look()
+    def evaluate_and_record(self) -> None:
+        """Evaluate and record the present state."""
+        self.evaluate_state()
         self.record()
 
     def keep(self, t: float) -> None:
@@ -244,7 +243,7 @@ class Replay(Run):
             raise JammingError(f"{names} jams {self.when()}: {text}")
         raise SimulationError(f"the step size of {names} underflows {self.when()}")
 
-    def lose(self, contact: str, c_n: float) -> Outcome:
+    def end_by_loss(self, contact: str, c_n: float) -> Outcome:
         """End by the loss of `contact`."""
         suffix = "to zero" if c_n > -1e3 * self.rounding else f"to {c_n:.3g} N"
         text = self.note(EventKind.CONTACT_LOST, f"c_n of {contact} falls {suffix}", contact, c_n)
@@ -261,7 +260,7 @@ class Replay(Run):
         self.in_motion = True
         return Stop.PHASE
 
-    def switch(self, contact: str, sign: float = 0.0) -> Stop:
+    def end_phase(self, contact: str, sign: float = 0.0) -> Stop:
         """End the phase as planned: a contact slips with a `sign`, or comes to rest."""
         self.note(EventKind.ARRIVAL, f"{contact} {'slips' if sign else 'comes to rest'}", contact)
         self.slip_signs = {contact: sign} if sign else {}
@@ -272,13 +271,13 @@ class Replay(Run):
         """End because the rolling contact `row` slips under forces [N], as planned or not."""
         name, bound = self.formation.names[row], self.formation.friction[row] * c_n
         if row in self.slipping:
-            return self.switch(name, -math.copysign(1.0, c_t))
+            return self.end_phase(name, -math.copysign(1.0, c_t))
         verb = "exceeds" if abs(c_t) - bound > 1e3 * self.rounding else "reaches"
         text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {verb} mu c_n = {bound:.5g} N"
         text = self.note(EventKind.SLIP, text, name, bound - abs(c_t))
         return Outcome(OutcomeKind.SLIPS, text)
 
-    def run_out(self) -> Outcome:
+    def end_by_torques(self) -> Outcome:
         """End with the torques."""
         until, distance = self.phase.until, math.nan
         if until.is_release:
@@ -330,15 +329,15 @@ class Replay(Run):
 
         After a stop the formation holds until the next torque step, or their end, within the
         `window` [s] or the planned remaining time; only the window counts `after_step`. The default
-        window is `settling` at low speed, else zero.
+        window is `delay` at low speed, else zero.
         """
         if window is None:
-            window = self.settling if abs(self._measure_rate()) < REST_SPEED else 0.0
+            window = self.delay if abs(self._measure_rate()) < REST_SPEED else 0.0
         until, next_phase = self.phase.until, self.next_phase
         self.note(EventKind.ARRIVAL, f"{until} reached", str(until), -self.rate)
         if self._ends_by_impact() and next_phase is not None:
             self.in_motion = True
-            return self.collide(next_phase) or Stop.PHASE
+            return self.apply_impact(next_phase) or Stop.PHASE
         self.in_motion = self.phase.end is End.SMOOTH
         if self.in_motion:
             return Stop.PHASE
@@ -352,13 +351,13 @@ class Replay(Run):
             # Rate-limited torques do not step. A motion with fading deceleration arrives early by
             # about the cube root of its error: the old torques act until its planned end.
             self.hold_end = max(self.hold_end, min(self.t + remaining, self.breaks[-1]))
-            self.settling_end = self.hold_end + self.rest_window
+            self.grace_end = self.hold_end + self.rest_window
         return Stop.PHASE
 
     def _rest(self) -> Ending:
         """Wait at rest for a start of motion, arrival, or loss of balance."""
         self.set_velocity(0.0)
-        self.look()
+        self.evaluate_state()
         self.record(still=True)
         if self.has_arrived():
             return self._arrive(self.rest_window)
@@ -370,7 +369,7 @@ class Replay(Run):
             next_rest = modes.Rest(self.next_phase.formation, self.z)
         while True:
             if self.t >= self.breaks[-1]:
-                return self.run_out()
+                return self.end_by_torques()
             if self.t >= self.hold_end:
                 x = min(1.0, max(-1.0, self.fraction(self.t)))
                 coefficients = self.torque.coefficients[self.piece]
@@ -391,10 +390,10 @@ class Replay(Run):
                     # Balance may be lost shortly before a torque step or the torques of the next
                     # phase.
                     t = self.time(end.x)
-                    if not (t < self.settling_end or self.next_step_time - t <= self.rest_window):
+                    if not (t < self.grace_end or self.next_step_time - t <= self.rest_window):
                         return self._collapse(end)
-            if self.t < self.settling_end < self.stop:
-                self.wait(self.settling_end)
+            if self.t < self.grace_end < self.stop:
+                self.wait(self.grace_end)
             else:
                 self.wait(self.stop)
                 self.next_piece()
@@ -414,7 +413,7 @@ class Replay(Run):
             return self.release(change.c_n)
         if change.closing:
             return self.reach_limit(change.closing)
-        return self.lose(change.contact, change.c_n)
+        return self.end_by_loss(change.contact, change.c_n)
 
     def move(self) -> Ending:
         """Integrate until rest, arrival, release of contacts or failure."""
@@ -481,11 +480,11 @@ class Replay(Run):
             # Of several close breaks, the phase ends at the nearest.
             next_break = self.breaks[self.piece + 2 : self.piece + 3]
             time = self.problem.scene.scales.time
-            lead = min(SETTLING, (next_break[0] - t) / time / 2 if len(next_break) else math.inf)
+            lead = min(EVENT_DELAY, (next_break[0] - t) / time / 2 if len(next_break) else math.inf)
             # Phase 1 of scene 584 of seed 1128 stops there, for the least effort.
-            stopping = self._time_to_stop() < SETTLING * time
-            passed = -SETTLING * speed <= distance <= lead * speed
-            speed = 0.0 if stopping or passed else math.inf
+            is_stopping = self._time_to_stop() < EVENT_DELAY * time
+            is_passed = -EVENT_DELAY * speed <= distance <= lead * speed
+            speed = 0.0 if is_stopping or is_passed else math.inf
         elif self.phase.end is End.IMPACT and self._ends_by_impact():
             piece = self.piece + 1
             speed = 0.0 if piece >= len(self.steps_at) or self.steps_at[piece] else speed
@@ -500,7 +499,7 @@ class Replay(Run):
             return False
         if piece + 1 >= len(self.breaks) or self.steps_at[piece]:
             return False
-        is_late = 2 * self._time_to_stop() > self.settling  # phase 4 of query 47: 9e-5 s
+        is_late = 2 * self._time_to_stop() > self.delay  # phase 4 of query 47: 9e-5 s
         # Larger than the integration error.
         return is_late and self._measure_rate() < -1e-7
 
@@ -510,9 +509,9 @@ class Replay(Run):
             # Before the next step the torques are those of the phase that ends.
             after_step = self.next_piece() and self.steps_at[self.piece]
             # Case of two breaks before the end: phase 10 of query 32.
-            return self._arrive(self.settling if after_step else self.rest_window, bool(after_step))
+            return self._arrive(self.delay if after_step else self.rest_window, bool(after_step))
         if self.t >= self.breaks[-1]:
-            return self.run_out()
+            return self.end_by_torques()
         self.next_piece()
         if not self.steps_at[self.piece]:
             return None
@@ -587,8 +586,8 @@ class Replay(Run):
     def _ends_by_impact(self) -> bool:
         """Whether the phase ends with an impact, at a speed above the errors of rest."""
         rate, time = -self._measure_rate(), self._time_to_stop() / self.problem.scene.scales.time
-        soft = rate < REST_SPEED or rate * time / 2 < ARRIVAL
-        return self.phase.end is End.IMPACT and not soft
+        is_soft = rate < REST_SPEED or rate * time / 2 < ARRIVAL
+        return self.phase.end is End.IMPACT and not is_soft
 
     def enter(self, phase: Phase, next_phase: Phase | None) -> None:
         """Enter the formation of `phase`; energy lost by the projection counts as impact loss.
@@ -604,10 +603,10 @@ class Replay(Run):
         self.y[:5] = self._close(formation)
         self.impact += float(energy - self.system.compute_energy(self.z, self.v))
         self.project_velocity(formation.evaluate(self.z[None], self.v[None]).P[0])
-        self.in_motion = self.in_motion and not self.stands
+        self.in_motion = self.in_motion and not self.is_at_rest
         if not self.in_motion:
             self.set_velocity(0.0)
-        # Only a contact that takes over from another one is gained at any speed.
+        # Only a contact that replaces another one is gained at any speed.
         contact = until.contact
         self.passable = phase.end is End.SMOOTH and (
             contact is None or takes_over(contact, formation.scene, formation.contacts)
@@ -637,15 +636,15 @@ class Replay(Run):
         except SimulationError as error:
             raise SimulationError(f"{error} {self.when()}") from None
 
-    def collide(self, next_phase: Phase) -> Outcome | None:
+    def apply_impact(self, next_phase: Phase) -> Outcome | None:
         """Plastic impact onto the next formation; returns the outcome if infeasible."""
         z = self._close(next_phase.formation)
         impact = compute_impact(self.formation, next_phase.formation, z, self.v)
-        name, least = impact.least_impulse
+        name, min_impulse = impact.least_impulse
         names = next_phase.formation.names
         normal = impact.p[: len(names)]
         impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
-        self.note(EventKind.IMPACT, "impact", name, least, f", in N s {impulses}")
+        self.note(EventKind.IMPACT, "impact", name, min_impulse, f", in N s {impulses}")
         if impact.violations:
             worst = impact.violations[0]
             text = f"{worst.describe()} in the impact {self.when()}"
@@ -657,7 +656,7 @@ class Replay(Run):
 
     def start_motion(self, departure: modes.StartDeparture) -> Ending:
         """Start a motion from rest, with the friction signs of its start mode."""
-        if not self.gets_on():
+        if not self.makes_progress():
             raise SimulationError(f"starting and stopping do not end {self.when()}")
         self.note(EventKind.START, "the object starts to move")
         formation, mode = self.formation, departure.mode
@@ -666,11 +665,11 @@ class Replay(Run):
             rows = (row for u in modes.list_units(formation) if u.frictional for row in u.rows)
             self.stuck = {row for row in rows if fixed[row]}
         self.set_mode(mode, departure.heading)
-        self.observe()
+        self.evaluate_and_record()
         return self.move()
 
     def continue_motion(self) -> Ending | None:
-        """Set the friction signs of the present velocity; returns what ends the motion, or None."""
+        """Set the friction signs of the present velocity; returns the ending of motion, or None."""
         formation, v = self.formation, self.v
         self.heading = v / np.sqrt(self.system.mass @ v**2)
         rates = modes.evaluate_rows(formation, self.z, v).A_t @ v
@@ -684,14 +683,14 @@ class Replay(Run):
         return self.restart(enters=formation.n_constraints < 4)
 
     def restart(self, stopped: Sequence[int] = (), enters: bool = False) -> Ending | None:
-        """Select contact modes after a jump of forces; returns what ends the motion, or None.
+        """Select contact modes after a jump of forces; returns the ending of motion, or None.
 
         `stopped`: contacts, then joints, that came to rest; `enters`: the formation is new.
         """
         if self._decide(stopped, enters):
             return self.come_to_rest()
-        self.observe()
-        at_rest, c_n = self._bridge(SETTLING), self.s.outputs.c_n
+        self.evaluate_and_record()
+        at_rest, c_n = self._bridge(EVENT_DELAY), self.s.outputs.c_n
         # More than rounding. Case: phase 5 of leg 59 of seed 1128.
         if at_rest or ((c_n < 0.99 * self.problem.epsilon).any() and self._bridge(MAX_BRIDGE)):
             return self.come_to_rest()
@@ -713,7 +712,7 @@ class Replay(Run):
         """
         formation, signs = self.formation, self.signs
         if formation.n_constraints >= 4:
-            if len(stopped) and self.stands:
+            if len(stopped) and self.is_at_rest:
                 # All rates are proportional; events of slow contacts are detected later.
                 stopped = np.flatnonzero(signs).tolist()
             for row in stopped:
@@ -721,8 +720,8 @@ class Replay(Run):
                 self.note_change(row, -signs[row], signs[row])
             self.signs = signs
             return False
-        self.look()
-        is_slow = np.abs(self.values[self.rate_rows]) < STANDING
+        self.evaluate_state()
+        is_slow = np.abs(self.values[self.rate_rows]) < ZERO_SPEED
         units = [
             unit
             for unit in modes.list_units(formation)
@@ -730,9 +729,9 @@ class Replay(Run):
         ]
         if not units:
             return False
-        if self.stands:
+        if self.is_at_rest:
             return True
-        if not self.gets_on():
+        if not self.makes_progress():
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
         mode = self._choose(signs, units)
@@ -761,13 +760,13 @@ class Replay(Run):
         return self._end_by_sticking() if self.resting else Stop.REST
 
     def _end_by_sticking(self) -> Stop:
-        return self.switch(", ".join(self.formation.names[row] for row in sorted(self.resting)))
+        return self.end_phase(", ".join(self.formation.names[row] for row in sorted(self.resting)))
 
     def _drop_repeated(self) -> None:
         """Remove the record of forces after a jump in a formation that ends at once."""
         last = self.records[-2:]
         is_repeated = len(last) > 1 and last[0].phase == last[1].phase == self.phase.index
-        if is_repeated and self.t - last[0].t <= self.settling:
+        if is_repeated and self.t - last[0].t <= self.delay:
             self.records.pop()
 
     def handle_tension(self, contacts: Sequence[int]) -> Ending:
@@ -779,7 +778,7 @@ class Replay(Run):
             self._drop_repeated()
             return self.release(min(forces[name] for name in self.releasable))
         name = min(pulling, key=forces.__getitem__)
-        return self.lose(name, min(0.0, forces[name]))
+        return self.end_by_loss(name, min(0.0, forces[name]))
 
     def slip(self) -> Ending:
         """End because a rolling contact slips, or by its release if that is planned."""
@@ -828,7 +827,7 @@ class Replay(Run):
         """
         rows, span = list[int](), window * self.system.scales.time
         # A passable phase may end before. Case: a pentagon (0, 0), (60, 0), (75, 30),
-        # (30, 60), (-10, 35) mm, where e3-tip2 goes on as v4-tip2 1 us after a torque step.
+        # (30, 60), (-10, 35) mm, where e3-tip2 becomes v4-tip2 1 us after a torque step.
         arrives = self.passable and self.has_arrived()
         if self.next_step_time - self.t <= span and not arrives:
             self.records.pop()
@@ -846,13 +845,13 @@ class Replay(Run):
             self.step_to(stretch)
             rows = self._select_rates(self.find_first(self.rate_rows))
             if not rows:
-                self.look()
+                self.evaluate_state()
                 return False
             self.records.pop()
             self.integrate_to(self.t + float(self.s.inputs.h[0]))
         at_rest = self._decide(rows)
         if not at_rest:
-            self.observe()
+            self.evaluate_and_record()
         return at_rest
 
     def _keeps_signs(self, span: float) -> bool:
@@ -866,17 +865,17 @@ class Replay(Run):
         rates = self.values[self.rate_rows][self.signs != 0]
         return bool((rates > 10 * span / time * (max_acceleration + max_speed**2)).all())
 
-    def note_change(self, row: int, before: float, after: float) -> None:
+    def note_change(self, row: int, old_sign: float, new_sign: float) -> None:
         """Record that a contact or joint sticks, slips or reverses."""
         names = self.formation.names
         contact = row < len(names)
         name = names[row] if contact else f"joint {row - len(names) + 1}"
-        kind, text = describe_change(name, before, after, "slides" if contact else "turns")
+        kind, text = describe_change(name, old_sign, new_sign, "slides" if contact else "turns")
         self.note(kind, text, name)
 
     def _choose(self, signs: Array, units: Sequence[modes.Unit]) -> modes.Mode:
         """Consistent mode of largest margin by signs of units at rest; `JammingError` if none."""
-        formation, scales, lookahead = self.formation, self.system.scales, self.settling
+        formation, scales, lookahead = self.formation, self.system.scales, self.delay
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + lookahead)]
         present, count = modes.evaluate_rows(formation, self.z, self.v), formation.n_contacts
         speeds, ratios = np.repeat([scales.speed, scales.rate], [count, 2]), [1.0]

@@ -17,17 +17,17 @@ from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
 from .system import (
     FIRST_STEP,
-    LOSSES,
+    N_LOSSES,
     ORDER,
     SHORTEST_STEP,
-    STANDING,
+    ZERO_SPEED,
     Modes,
     ModeStepper,
     System,
     build_stepper,
 )
 
-SAME = 1e-9  # difference of two instants that counts as zero, relative to the period
+TIME_TOLERANCE = 1e-9  # difference of two instants that counts as zero, relative to the period
 
 
 class StuckError(ArithmeticError):
@@ -68,7 +68,7 @@ class Run(ABC):
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
         self.steps_at = [True, *self.find_torque_steps(torque.jumps).tolist()]
-        self.y = np.concatenate([z, v, np.zeros(LOSSES)])
+        self.y = np.concatenate([z, v, np.zeros(N_LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
         self.phase_index = self.steps = self.rejected = 0
@@ -129,11 +129,11 @@ class Run(ABC):
         """Enter the next piece of the torques; returns how that ends the motion, or None."""
 
     @property
-    def stands(self) -> bool:
+    def is_at_rest(self) -> bool:
         """Whether all velocities are zero."""
-        return self.system.is_slower(self.v, STANDING)
+        return self.system.is_slower(self.v, ZERO_SPEED)
 
-    def gets_on(self) -> bool:
+    def makes_progress(self) -> bool:
         """Count a choice of contact modes; False after 60 in a row without progress of time."""
         shortest = 100 * SHORTEST_STEP * self.system.scales.time
         self.decisions = self.decisions + 1 if self.t - self.decision_time <= shortest else 0
@@ -230,10 +230,10 @@ class Run(ABC):
         self.s.step()
         self.values = self.measure()
 
-    def look(self) -> None:
+    def evaluate_state(self) -> None:
         """Evaluate the present state."""
         self.s.inputs.y[:], self.s.inputs.t[:] = self.y, self.t
-        self.s.look()
+        self.s.evaluate_state()
         self.values = self.measure()
 
     def keep(self, t: float) -> None:
@@ -387,14 +387,14 @@ class Feedback:
         self.law = law
         period = require_number(law.period, "period", positive=True)
         delay = require_number(law.delay, "delay", nonnegative=True)
-        ticks = period * np.arange(int(np.ceil(until / period - SAME)))
+        ticks = period * np.arange(int(np.ceil(until / period - TIME_TOLERANCE)))
         times = np.sort(np.concatenate([ticks, ticks[1:] + delay]))
-        times = times[times < until - SAME * period]
-        times = times[np.diff(times, prepend=-np.inf) > SAME * period]
+        times = times[times < until - TIME_TOLERANCE * period]
+        times = times[np.diff(times, prepend=-np.inf) > TIME_TOLERANCE * period]
         self._samples = np.zeros((len(ticks), 2))
         # Rounding must not place an instant before its own sample.
-        self._latest = np.floor(times / period + SAME).astype(int)
-        self._source = np.floor((times - delay) / period + SAME).astype(int).clip(0)
+        self._latest = np.floor(times / period + TIME_TOLERANCE).astype(int)
+        self._source = np.floor((times - delay) / period + TIME_TOLERANCE).astype(int).clip(0)
         self.torque = TorqueProfile(np.append(times, until), np.zeros((len(times), 2, 1)))
 
     def begin(

@@ -232,7 +232,7 @@ def _read_modes(problem: Problem, plan: Trajectory, row: int) -> Modes:
     z, v, a = plan.z[row], plan.z_dot[row], plan.z_ddot[row]
     rows = system.evaluate(z, v, kept)
     dt = 1e-3 * system.scales.time
-    sliding_signs = np.sign(rows.A_t @ v + dt * (rows.A_t @ a + rows.bend_t))
+    sliding_signs = np.sign(rows.A_t @ v + dt * (rows.A_t @ a + rows.A_t_dot_v))
     phase = problem.phases[int(plan.phase[row])]
     is_rolling = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
     Xi = np.where(is_rolling, 0.0, sliding_signs)

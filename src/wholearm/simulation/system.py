@@ -46,12 +46,12 @@ from ..scene.model import Scales, Scene
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin due to rounding
 ARRIVAL = 3e-5  # largest distance to the end of a phase that counts as arrival
 REST_SPEED = 2e-4  # largest speed that counts as rest at the end of a phase
-STANDING = 1e-9  # sliding speed that counts as zero: its sign is an integration error
-SETTLING = 2e-5  # largest shift of an event by rounding; modes are evaluated after this delay
+ZERO_SPEED = 1e-9  # sliding speed that counts as zero: its sign is an integration error
+EVENT_DELAY = 2e-5  # largest shift of an event by rounding; modes are evaluated after this delay
 REST_WINDOW = 2e-3  # longest rest before a torque break: too short for contacts to open
 FIRST_STEP = 2e-2  # first trial step from rest
 SHORTEST_STEP = 1e-13  # smallest step, relative to the scene's time and the elapsed time
-STILL = 1e-10  # largest acceleration that counts as rounding
+ZERO_ACCEL = 1e-10  # largest acceleration that counts as rounding
 
 
 class ContactRows(NamedTuple):
@@ -59,8 +59,8 @@ class ContactRows(NamedTuple):
 
     A: Array  # A, A_t (m, n):
     A_t: Array
-    bend: Array  # bend, bend_t (m,): A' z' and A_t' z'
-    bend_t: Array
+    A_dot_v: Array  # A_dot_v, A_t_dot_v (m,): A' z' and A_t' z'
+    A_t_dot_v: Array
     slip: Array  # (m,) [m]: slip coordinates
 
 
@@ -81,8 +81,8 @@ class Structure:
             column = ca.vertcat(ca.SX(0, 1), *values)
             rows = ca.jacobian(column, self.z)
             parts.append((column, rows, ca.jtimes(rows @ v, self.z, v)))
-        (gap, A, bend), (slip, A_t, bend_t) = parts
-        return gap, slip, A, A_t, bend, bend_t
+        (gap, A, A_dot_v), (slip, A_t, A_t_dot_v) = parts
+        return gap, slip, A, A_t, A_dot_v, A_t_dot_v
 
     @cached_property
     def gaps(self) -> Batch:
@@ -143,7 +143,7 @@ class System:
             rows = _build_rows(self.structure, tuple(pairs)).at(z, v, self.geometry)[0]
         return ContactRows(rows[:, :n], rows[:, n : 2 * n], *rows[:, 2 * n :].T)
 
-    def look(self, z: Array) -> tuple[Array, Array]:
+    def measure_at(self, z: Array) -> tuple[Array, Array]:
         """As `measure`, at one configuration: shape (N,) each [m]."""
         gaps, ranges = self.structure.gaps.at(z, self.geometry)[0]
         return gaps, ranges
@@ -158,7 +158,7 @@ class System:
         """Mechanical energy: kinetic energy less the work of the applied force, (...) [J]."""
         return np.asarray(0.5 * (v**2) @ self.mass - z @ self.applied)
 
-    def push(self, v: Array, tau: Array, sigma: Array) -> Array:
+    def sum_forces(self, v: Array, tau: Array, sigma: Array) -> Array:
         """Forces on z without contact forces, (n,); dry friction opposes the directions `sigma`."""
         force = self.applied - self.viscous * v - self.dry * sigma
         driven = list(self.structure.driven)
@@ -232,11 +232,11 @@ def _list_link_pairs(links: Sequence[Link], rounded: bool) -> list[ContactPair]:
     return pairs
 
 
-LOSSES = 4  # integrals: work, losses to viscous, dry and sliding friction
-ORDER = 8
+N_LOSSES = 4  # number of integrals: work, losses to viscous, dry and sliding friction
+ORDER = 8  # of the steps
 
 # fmt: off
-ROWS: tuple[dict[int, float], ...] = (
+STAGE_WEIGHTS: tuple[dict[int, float], ...] = (
     {},
     {0: 0.05260015195876773},
     {0: 0.0197250569845379, 1: 0.0591751709536137},
@@ -259,10 +259,10 @@ ROWS: tuple[dict[int, float], ...] = (
      10: 0.6433927460157636},
 )
 """Runge-Kutta coefficients a_ij of each stage i, by stage j."""
-NODES = tuple(sum(row.values()) for row in ROWS)
+STAGE_TIMES = tuple(sum(row.values()) for row in STAGE_WEIGHTS)
 """Times of the stages, as fractions of a step."""
 INNER_STAGES = (3, 5, 9, 10)  # stages spread over the step with accurate states
-WEIGHTS = {
+WEIGHTS_8 = {
     0: 0.054293734116568765, 5: 4.450312892752409, 6: 1.8915178993145003, 7: -5.801203960010585,
     8: 0.3111643669578199, 9: -0.1521609496625161, 10: 0.20136540080403034, 11: 0.04471061572777259,
 }
@@ -273,8 +273,8 @@ ERROR_5 = {
     11: -0.022355307863886294,
 }
 """Differences of the weights of order 8 from those of order 5."""
-_THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
-ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in WEIGHTS.items()}
+_WEIGHTS_3 = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
+ERROR_3 = {j: w - _WEIGHTS_3.get(j, 0.0) for j, w in WEIGHTS_8.items()}
 """Differences of the weights of order 8 from those of order 3."""
 # fmt: on
 
@@ -282,7 +282,7 @@ ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in WEIGHTS.items()}
 class Modes(NamedTuple):
     """Contact modes of a smooth motion."""
 
-    kept: tuple[int, ...] = ()  # pairs that press
+    kept: tuple[int, ...] = ()  # pairs with contact forces
     # rows held by each friction force, in rising order: of kept pairs that stick together, then
     # of a coordinate
     holders: tuple[tuple[int, ...], ...] = ()
@@ -344,14 +344,14 @@ class EventRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ModeStepper:
-    """Compiled steps of one set of modes; `step` and `look` read `inputs`, write `outputs`."""
+    """Compiled steps of one set of modes; the functions read `inputs` and write `outputs`."""
 
     modes: Modes  # without signs
     inputs: Inputs
     outputs: Outputs
     rows: EventRows
-    step: Any  # step, look: a step of length h; the same outputs at the initial state
-    look: Any
+    step: Any  # step, evaluate_state: a step of length h; the same outputs at the initial state
+    evaluate_state: Any
 
     def load(self, system: System, tolerance: float, z: Array) -> None:
         """Set the constant inputs of a motion; contacts stick at their slip coordinates at z."""
@@ -371,36 +371,36 @@ def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeSteppe
     """Steps of a set of modes without its signs, for torques of a polynomial degree."""
     n, k, s = len(structure.angular), len(modes.kept), len(modes.holders)
     numbers = structure.geometry.shape[0], n, n, n, 2 * n, n, n, k, 2
-    sizes = 2 * n + LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
+    sizes = 2 * n + N_LOSSES, 1, 1, 1, k, n, s, 2, 2 * degree + 2, *numbers
     bounds = np.cumsum([0, *sizes]).tolist()
     symbols = Inputs(*map(ca.SX.sym, Inputs._fields, sizes))._replace(geometry=structure.geometry)
     rows = EventRows(*(slice(*pair) for pair in pairwise(np.cumsum([0, k, 2 * s, k, n]).tolist())))
     stage, report, project = _build_motion(structure, modes, symbols)
     # One vector takes less time than many.
     packed = ca.MX.sym("inputs", bounds[-1])
-    at, stages = Inputs(*ca.vertsplit(packed, bounds)), list[Expression]()
+    x, stages = Inputs(*ca.vertsplit(packed, bounds)), list[Expression]()
 
     def rate(state: Expression, time: Expression) -> Expression:
         rates, margins = stage(state, time, packed)
         stages.append(margins)
         return rates
 
-    end, fifth, third = build_step(rate, at.y, at.t, at.h, 2 * n)
-    error = build_error(fifth, third, at.y[: 2 * n], at.units, at.tolerance)
+    end, fifth, third = build_step(rate, x.y, x.t, x.h, 2 * n)
+    error = build_error(fifth, third, x.y[: 2 * n], x.units, x.tolerance)
     sampled_margins = ca.vertcat(stages[0], *(stages[row] for row in INNER_STAGES))
-    end = ca.vertcat(project(at, end[: 2 * n]), end[2 * n :])
+    end = ca.vertcat(project(x, end[: 2 * n]), end[2 * n :])
     inputs, functions = np.zeros(bounds[-1]), []
     for state, time, extra in (
-        (end, at.t + at.h, (error, sampled_margins)),
-        (at.y, at.t, (0, ca.DM.zeros(sampled_margins.shape[0]))),
+        (end, x.t + x.h, (error, sampled_margins)),
+        (x.y, x.t, (0, ca.DM.zeros(sampled_margins.shape[0]))),
     ):
         results = [state, *report(state[: 2 * n], time, packed), *map(ca.MX, extra)]
         functions.append(ca.Function("step", [packed], [ca.densify(ca.vertcat(*results))]))
     offsets = np.cumsum([part.shape[0] for part in results])
     outputs = np.zeros(offsets[-1])
-    step, look = (bind(function, [inputs], [outputs]) for function in functions)
+    step, evaluate_state = (bind(function, [inputs], [outputs]) for function in functions)
     views = Inputs(*np.split(inputs, bounds[1:-1])), Outputs(*np.split(outputs, offsets[:-1]))
-    return ModeStepper(modes, *views, rows, step, look)
+    return ModeStepper(modes, *views, rows, step, evaluate_state)
 
 
 def _build_motion(
@@ -414,7 +414,7 @@ def _build_motion(
     """
     n, k, z = len(structure.angular), len(modes.kept), structure.z
     v, time, mu, inverse_mass = ca.SX.sym("v", n), ca.SX.sym("time"), x.mu, x.inverse_mass
-    gap, slip, A, A_t, bend, bend_t = structure.build_rows(modes.kept, v)
+    gap, slip, A, A_t, A_dot_v, A_t_dot_v = structure.build_rows(modes.kept, v)
     first_rows = [rows[0] for rows in modes.holders]
     groups = [list(rows) for rows in modes.holders if rows[0] < k]
     is_sliding = np.ones(k)
@@ -422,7 +422,7 @@ def _build_motion(
     friction_ratio = mu * x.Xi * ca.DM(is_sliding)
     A_held = ca.vertcat(A_t, ca.DM(np.eye(n)))[first_rows, :]
     P, G = (ca.vertcat(part, A_held) for part in (A, A - ca.repmat(friction_ratio, 1, n) * A_t))
-    P_dot_v = ca.vertcat(bend, ca.vertcat(bend_t, ca.DM.zeros(n))[first_rows])
+    P_dot_v = ca.vertcat(A_dot_v, ca.vertcat(A_t_dot_v, ca.DM.zeros(n))[first_rows])
     tau = _build_torque(time, x.piece, x.torque)
     viscous, dry = x.viscous * v, x.dry * x.sigma
     motor_force = ca.SX(n, 1)
@@ -453,15 +453,15 @@ def _build_motion(
     r = ca.vertcat(gap, ca.vertcat(slip, z)[first_rows] - x.anchors)
     constraints = ca.Function("rows", [z, x.anchors, x.geometry], [ca.densify(P), ca.densify(r)])
 
-    def project(at: Inputs, state: Expression) -> Expression:
+    def project(data: Inputs, state: Expression) -> Expression:
         if not P.shape[0]:
             return state
         # A step leaves gaps of the size of its error, so one Newton iteration closes them.
         correct, speed = _build_correction(*P.shape), state[n:]
-        rows, r = constraints(state[:n], at.anchors, at.geometry)
-        place = state[:n] - correct(rows, r, at.inverse_mass)
-        rows, _ = constraints(place, at.anchors, at.geometry)
-        return ca.vertcat(place, speed - correct(rows, rows @ speed, at.inverse_mass))
+        rows, r = constraints(state[:n], data.anchors, data.geometry)
+        place = state[:n] - correct(rows, r, data.inverse_mass)
+        rows, _ = constraints(place, data.anchors, data.geometry)
+        return ca.vertcat(place, speed - correct(rows, rows @ speed, data.inverse_mass))
 
     return stage, report, project
 
@@ -510,9 +510,9 @@ def build_step(
         function = _build_combination(y.shape[0], count, tuple(weights.values()))
         return function(start, h, *(rates[stage] for stage in weights))
 
-    for time, row in zip(ca.vertsplit(t + h * ca.DM(NODES)), ROWS, strict=True):
+    for time, row in zip(ca.vertsplit(t + h * ca.DM(STAGE_TIMES)), STAGE_WEIGHTS, strict=True):
         rates.append(rate(combine(y, row), time))
-    return combine(y, WEIGHTS, y.shape[0]), combine(0, ERROR_5), combine(0, ERROR_3)
+    return combine(y, WEIGHTS_8, y.shape[0]), combine(0, ERROR_5), combine(0, ERROR_3)
 
 
 @lru_cache(maxsize=128)

@@ -32,7 +32,7 @@ from ..results.trajectory import Trajectory, interpolate_quintic
 from ..scene.model import Scene
 from ..simulation import modes
 from ..simulation.events import EventKind, Simulation
-from ..simulation.system import SETTLING
+from ..simulation.system import EVENT_DELAY
 
 if TYPE_CHECKING:
     from .free import FreeReport
@@ -172,7 +172,7 @@ def find_finger_gap(scene: Scene, motion: Simulation | Trajectory) -> results.Fi
     times = np.append(t, t[starts] + offsets)
     order = np.argsort(times, kind="stable")
     gaps = evaluate_finger_gap(scene, np.concatenate([z, interpolated]))
-    min_time = 2 * SETTLING * scene.scales.time
+    min_time = 2 * EVENT_DELAY * scene.scales.time
     return results.FingerGap(*find_lowest(times[order], gaps[order], min_time))
 
 
@@ -594,7 +594,7 @@ def find_stuck(
     before, after = excess[free[0] - 1], excess[free[0]]
     t_before, t_after = t[free[0] - 1 : free[0] + 1] - start
     stuck = float(t_after - after / (after - before) * (t_after - t_before))
-    return stuck if stuck > SETTLING * scene.scales.time else 0.0
+    return stuck if stuck > EVENT_DELAY * scene.scales.time else 0.0
 
 
 _ELIMINATED = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2

@@ -30,7 +30,7 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, B, V, apply, reduced_inertia
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
-from ..nlp import Columns, SolverStatistics, book, build_solver
+from ..nlp import Columns, SolverStatistics, add_cost, build_solver
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan, share_duration, value_of
 from ..refinement import SOLVES, refine
@@ -850,8 +850,8 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         rows["joins"] = ca.vec(joins[:, list(slow)])
         rows["begins"] = ca.vertcat(*find_first_slopes(a))
     g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
-    nlp = {"x": unknowns.every, "p": symbols.every, "f": ca.sum1(node_costs), "g": g.write(**rows)}
-    book(SolverStatistics(build_time=time.perf_counter() - started))
+    nlp = {"x": unknowns.stack, "p": symbols.stack, "f": ca.sum1(node_costs), "g": g.write(**rows)}
+    add_cost(SolverStatistics(build_time=time.perf_counter() - started))
     # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if is_soft else {"mu_oracle": "probing"}

@@ -2,8 +2,8 @@
 
 A guess follows a geometric path from rest to rest, or a plan. Contact modes are those of the path,
 or those of a motion with smoothed friction, tanh(rate / smoothing) in place of the sign (friction
-homotopy). That motion needs no modes, and is split into stages by the signs of its rates. A contact
-rolls where its rate and its smoothed friction stay small for a while.
+homotopy). That motion has no modes, and is split into stages by the signs of its rates. A contact
+rolls over intervals in which its rate and its smoothed friction are small.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from ...results.trajectory import Motion
 from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan
 from .mode_search import (
-    LEAST_INTERVALS,
+    MIN_INTERVALS,
     can_roll,
     divide,
     drop,
@@ -58,8 +58,8 @@ NEAREST_END = "a motion to the nearest end of the phase"
 PROBLEM_MODES = "the contact modes that the problem gives"
 LONG_DURATION = f"{NEAREST_END}, 4 times as long as a fall over that height"  # of two routes
 MIN_MARGIN = 1e-3  # margin above which a path counts as feasible
-FALL_TIMES = 2.0  # guessed duration, over that of a fall over the path's length
-AT_REST = 1e-4  # speed that counts as a stop, in the scene's units
+FALL_TIMES = 2.0  # guessed duration, over that of a free fall over the path's length
+REST_SPEED = 1e-4  # speed that counts as a stop, in the scene's units
 MIN_FRACTION = 0.05  # least duration of a piece over that of its stage
 MAX_PIECES = 8  # most pieces of a stage
 _GUESS_FORCE = 0.5  # normal forces of an initial guess, over the weight of the object
@@ -92,10 +92,10 @@ class Guess(NamedTuple):
     def is_rest_to_rest(self) -> bool:
         """Whether it begins and ends at rest."""
         ends = self.stages[0].guess.nodes[0, 1], self.stages[-1].guess.nodes[-1, 1]
-        return float(np.abs(ends).max()) < AT_REST
+        return float(np.abs(ends).max()) < REST_SPEED
 
     def from_rest(self) -> Guess:
-        """Copy that starts at rest: plans of a block without stops pass there at speed."""
+        """Copy that starts at rest, as plans of a block without stops may start in motion."""
         first, *others = self.stages
         if np.abs(first.guess.nodes[0, 1]).max() < 1e-9:  # rounding
             return self
@@ -109,7 +109,7 @@ class Guess(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Guesses:
-    """The guesses of a search's phases, each computed when it is used."""
+    """Guesses of a search's phases, evaluated lazily."""
 
     search: TimeSearch
     z: Array  # (5,): start
@@ -187,7 +187,7 @@ class Guesses:
             rolling = list(stage.formation.rolling_rows)
             for start, stop, directions in motion.spans:
                 duration = stop - start
-                count = max(LEAST_INTERVALS, round(duration / motion.duration * stage.intervals))
+                count = max(MIN_INTERVALS, round(duration / motion.duration * stage.intervals))
                 if period := self.search.source.scene.control_period:
                     count = max(count, math.ceil(duration / period))
                 breaks = np.linspace(0.0, 1.0, count + 1)
@@ -325,7 +325,7 @@ class Guesses:
                     return goal
             return None
 
-        goals, firsts = [nearest], list[Array]()
+        goals, first_goals = [nearest], list[Array]()
         for secant in (*N.T, *-N.T):
             previous, length = nearest, step
             for _ in range(12):  # most ends on either side of the nearest one
@@ -333,10 +333,10 @@ class Guesses:
                 if goal is None:
                     break
                 if previous is nearest:
-                    # Directions across the ends lead back to the same.
-                    if any((goal - nearest) @ (first - nearest) > 0 for first in firsts):
+                    # Other directions may give the same ends.
+                    if any((goal - nearest) @ (first - nearest) > 0 for first in first_goals):
                         break
-                    firsts.append(goal)
+                    first_goals.append(goal)
                 goals.append(goal)
                 secant = (goal - previous) * metric
                 secant = secant / np.linalg.norm(secant) / metric
@@ -412,8 +412,8 @@ def find_margin(path: PathGuess, epsilon: float, with_profile: bool = False) -> 
     A_ub, b_ub = rows.reshape(-1, size), slack[..., ONE].ravel()
     speed_bounds = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0)]  # the largest b
 
-    def maximise(objective: Array, least: float | None) -> Any:
-        bounds = [*speed_bounds, (least, 1.0)]
+    def maximise(objective: Array, min_margin: float | None) -> Any:
+        bounds = [*speed_bounds, (min_margin, 1.0)]
         return linprog(-objective, A_ub, b_ub, bounds=bounds, method="highs")
 
     solution = maximise(np.eye(size)[-1], None)
@@ -422,9 +422,9 @@ def find_margin(path: PathGuess, epsilon: float, with_profile: bool = False) -> 
     multipliers = np.abs(solution.ineqlin.marginals).reshape(m, -1).sum(axis=0)
     sums = np.bincount(limits.owners[limits.sides[0]], multipliers)
     margin, profile = float(solution.x[-1]), None
-    # A fast one may lose half of a positive margin, and a little of a negative one.
-    speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(0.5 * margin, margin - 0.02)
-    fastest = maximise(speeds, least) if with_profile else None
+    # A fast motion may lose half of a positive margin, and 0.02 of a negative one.
+    speeds, min_margin = np.where(np.arange(size) <= m, 1.0, 0.0), min(0.5 * margin, margin - 0.02)
+    fastest = maximise(speeds, min_margin) if with_profile else None
     if fastest is not None and fastest.status == 0:
         v = scene.scales.speed * np.sqrt(np.maximum(fastest.x[: m + 1], 0.0))
         floor = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
@@ -464,9 +464,9 @@ def split_path(path: PathGuess) -> list[PathGuess]:
             # Tied rows together, in order of time.
             changed = np.flatnonzero(piece_signs != signs[stop]).tolist()
             tied = (find_tied(formation, z[stop], row) for row in changed)
-            before, after = rates[stop - 1 : stop + 1]
-            crossing = np.full(len(before), 0.5)
-            np.divide(before, before - after, out=crossing, where=before * after < 0)
+            rate, next_rate = rates[stop - 1 : stop + 1]
+            crossing = np.full(len(rate), 0.5)
+            np.divide(rate, rate - next_rate, out=crossing, where=rate * next_rate < 0)
             groups = {tuple(sorted({*rows} & {*changed})) for rows in tied}
             reversals = sorted(groups, key=lambda group: (crossing[group[0]], group))
         # The reversals are within the steps before and after the cut.
@@ -522,8 +522,8 @@ def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
     widths = np.maximum(widths, min(MIN_FRACTION / 2, 0.5 / len(widths)))
     edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
     modes = [tuple(signs)]
-    for _, new in changes:
-        modes.append(tuple(new.get(row, sign) for row, sign in enumerate(modes[-1])))
+    for _, new_signs in changes:
+        modes.append(tuple(new_signs.get(row, sign) for row, sign in enumerate(modes[-1])))
     return [*divide(stage, scheme, edges, modes)]
 
 
@@ -626,7 +626,7 @@ def guess_stages(
             approach = row, value, 1.0 if value > z_start[row] else -1.0
         phase_length = lengths[[owner is phase for owner, _ in parts]].sum()
         intervals = factor * (options.time_intervals or 10)  # of a phase to start with
-        count = max(LEAST_INTERVALS, round(lengths[k] / phase_length * intervals))
+        count = max(MIN_INTERVALS, round(lengths[k] / phase_length * intervals))
         times, places = clock[k : k + 2], ends[k : k + 2]
         guess = _guess(path, search.scheme, count, times, places, duration, profile)
         # Limits near zero along the path, and that of the phase's end.
@@ -744,8 +744,8 @@ def _reverse_first(path: PathGuess, previous: PathGuess) -> list[PathGuess]:
     them `heptagon.toml` takes half as long again to plan, with a smaller margin.
     """
     # Rolling contacts have no direction to keep.
-    slides = np.delete(np.arange(previous.formation.n_contacts), previous.formation.rolling_rows)
-    directions = {previous.formation.names[k]: previous.directions.Xi[k] for k in slides}
+    sliding = np.delete(np.arange(previous.formation.n_contacts), previous.formation.rolling_rows)
+    directions = {previous.formation.names[k]: previous.directions.Xi[k] for k in sliding}
     path_signs, formation = np.concatenate(path.directions), path.formation
     n_c = formation.n_contacts
     signs = path_signs.copy()
@@ -759,7 +759,7 @@ def _reverse_first(path: PathGuess, previous: PathGuess) -> list[PathGuess]:
     pieces = []
     cuts = np.linspace(0, len(path.z) - 1, len(reversals) + 2).astype(int)
     for k, (begin, stop) in enumerate(pairwise(cuts)):
-        rows = reversals[k] if k < len(reversals) else path.turns
+        rows = reversals[k] if k < len(reversals) else path.reversals
         pieces.append(_make_piece(formation, path.z[begin : stop + 1], signs, rows))
         if k < len(reversals):
             signs[list(reversals[k])] = path_signs[list(reversals[k])]

@@ -1,6 +1,6 @@
 """Local search for contact modes: neighbouring mode sequences are solved, better ones accepted.
 
-A mode has a sign for each contact and joint of a stage: its sliding direction or rotation, or 0 if
+A mode has a sign for each contact and joint of a stage: the sliding or turning direction, or 0 if
 it rolls. Rates whose sign differs in successive stages are zero between them (`link`).
 """
 
@@ -22,12 +22,11 @@ from ...mechanics.dynamics import Directions, split_forces
 from ...mechanics.statics import Statics
 from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, make_formation, resample
-from .time_nlp import least_rates, new_rows, stops
+from .time_nlp import all_rates_vanish, least_rates, new_rows
 
-LEAST_INTERVALS = 3  # fewest intervals of a stage
-MIN_GAIN = 1e-4  # least relative gain of a neighbour; dropping a vanished stage may cost as much
+MIN_INTERVALS = 3  # fewest intervals of a stage
+MIN_GAIN = 1e-4  # least relative gain of a neighbour; a vanished stage is dropped at this loss
 MAX_ITER = 50  # most solver iterations for a neighbour
-
 
 Mode = tuple[float, ...]
 """Contact mode of a stage: signs of the rates of (contacts, joints); zero for rolling contacts."""
@@ -65,10 +64,10 @@ def with_mode(stage: Stage, mode: Mode) -> Stage:
 def link(stages: Sequence[Stage]) -> list[Stage]:
     """Stages with end conditions that follow from their modes and phases."""
     linked, joints = list[Stage](), ("joint 1", "joint 2")
-    for stage, following in zip(stages, [*stages[1:], None], strict=True):
-        last = following is None or following.phase != stage.phase
+    for stage, next_stage in zip(stages, [*stages[1:], None], strict=True):
+        last = next_stage is None or next_stage.phase != stage.phase
         until, impact = stage.goal if last else None, last and stage.impact
-        guess, n = stage.guess, following.formation.n_constraints if following and impact else 0
+        guess, n = stage.guess, next_stage.formation.n_constraints if next_stage and impact else 0
         if len(guess.impulses) != n:
             guess = guess._replace(impulses=np.zeros(n))
         opens = bool(linked) and linked[-1].phase != stage.phase
@@ -78,42 +77,42 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
         if linked and not (linked[-1].ends_in_impact or linked[-1].ends_at_rest):
             contacts = linked[-1].formation.contacts
             new = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in contacts)
-        if following is not None and not impact:
+        if next_stage is not None and not impact:
             names = (*stage.formation.names, *joints)
-            next_names = (*following.formation.names, *joints)
-            after = dict(zip(next_names, mode_of(following), strict=True))
+            next_names = (*next_stage.formation.names, *joints)
+            signs = dict(zip(next_names, mode_of(next_stage), strict=True))
             pairs = enumerate(zip(names, mode_of(stage), strict=True))
-            reversals = tuple(k for k, (name, sign) in pairs if sign * after.get(name, 0.0) < 0)
-            ending = find_ending_constraints(stage, following)
-            rows = new_rows(stage.formation, following.formation)
-            next_formation = following.formation if rows else None
+            reversals = tuple(k for k, (name, sign) in pairs if sign * signs.get(name, 0.0) < 0)
+            ending = find_ending_constraints(stage, next_stage)
+            rows = new_rows(stage.formation, next_stage.formation)
+            next_formation = next_stage.formation if rows else None
         stage = replace(stage, next_formation=next_formation, new_contacts=new, reversals=reversals)
-        if rests := following is None or (last and stops(stage)):
-            ending = ()  # other torques begin after a pause
-        linked.append(replace(stage, ends_at_rest=rests, ending_constraints=ending))
+        if at_rest := next_stage is None or (last and all_rates_vanish(stage)):
+            ending = ()  # torques may change in the pause
+        linked.append(replace(stage, ends_at_rest=at_rest, ending_constraints=ending))
     return linked
 
 
-def find_ending_constraints(stage: Stage, following: Stage) -> tuple[tuple[int, float], ...]:
+def find_ending_constraints(stage: Stage, next_stage: Stage) -> tuple[tuple[int, float], ...]:
     """`Stage.ending_constraints`: contacts released, with 0, or starting to slide, with a sign."""
     formation, ending = stage.formation, list[tuple[int, float]]()
-    renamed = list_renamed(formation.scene, formation.contacts, following.formation.contacts)
+    renamed = list_renamed(formation.scene, formation.contacts, next_stage.formation.contacts)
     for k, contact in enumerate(formation.contacts):
         if contact in renamed:
             continue
-        if contact not in following.formation.contacts:
+        if contact not in next_stage.formation.contacts:
             ending.append((k, 0.0))
-        elif contact in formation.rolling and contact not in following.formation.rolling:
-            row = following.formation.contacts.index(contact)
-            ending.append((k, float(following.directions.Xi[row])))
+        elif contact in formation.rolling and contact not in next_stage.formation.rolling:
+            row = next_stage.formation.contacts.index(contact)
+            ending.append((k, float(next_stage.directions.Xi[row])))
     return tuple(ending)
 
 
 def drop_stops(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages without brief ones that begin or end where the motion stops within a phase.
+    """Stages without brief ones next to a stop of the motion within a phase.
 
-    Continuous torques do not pause there, and torques held over periods only for whole periods:
-    phase 9 of query 28 starts with a stage of 0.1 ms.
+    Continuous or sampled torques cannot pause there. Case: phase 9 of query 28 starts with a stage
+    of 0.1 ms.
     """
     remaining, max_rate = list(stages), max(np.abs(s.guess.nodes[:, 1]).max() for s in stages)
     for k in reversed(range(len(stages) - 1)):
@@ -127,10 +126,10 @@ def drop_stops(stages: Sequence[Stage]) -> list[Stage]:
 
 
 def adapt_ends(stages: Sequence[Stage], search: TimeSearch) -> list[Stage]:
-    """Stages that begin from rest, and come to rest, in modes that continuous torques allow.
+    """Stages whose modes next to rest are statically feasible with continuous torques.
 
-    Where statics exclude a mode, the first or last interval gets the nearest feasible one: phase 3
-    of query 18 begins with a contact that rolls, and ends with one that slides back.
+    If statics exclude a mode, the first or last interval gets the nearest feasible one. Case: phase
+    3 of query 18 begins with a rolling contact, and ends with one that slides back.
     """
     starts_at_rest, adapted = True, list[Stage]()
     for stage in stages:
@@ -178,9 +177,9 @@ def _list_end_modes(stage: Stage, search: TimeSearch, node: int) -> list[tuple[f
 def change_ends(stages: Sequence[Stage], search: TimeSearch) -> Iterator[list[Stage]]:
     """Stages with another mode in the first or last interval of a motion from rest to rest.
 
-    Modes are those that continuous torques allow there. Modes in which a contact rolls come first,
-    the slowest contact before others: with continuous torques it may not slide at all. The others
-    are sorted by the number of different signs and by their margins.
+    Modes are those that continuous torques allow there. Modes with a rolling contact come first,
+    the slowest contact before others, as it may not slide with continuous torques. The others are
+    sorted by the number of different signs and by their margins.
     """
     starts_at_rest, candidates = True, list[tuple[int, float, list[Stage]]]()
     for k, stage in enumerate(stages):
@@ -205,7 +204,7 @@ def divide(
 ) -> Iterator[Stage]:
     """Pieces of a stage between `edges`, fractions of it, with a mode each; not linked."""
     for (begin, stop), mode in zip(pairwise(edges), modes, strict=True):
-        count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
+        count = max(MIN_INTERVALS, round((stop - begin) * stage.intervals))
         guess = resample(stage.guess, scheme, np.linspace(begin, stop, count + 1))
         yield with_mode(replace(stage, guess=guess), mode)
 
@@ -218,7 +217,7 @@ def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> li
         if first == last:
             continue
         breaks = stage.guess.breaks[first : last + 1]
-        while len(breaks) - 1 < LEAST_INTERVALS:
+        while len(breaks) - 1 < MIN_INTERVALS:
             breaks = np.sort(np.append(breaks, (breaks[1:] + breaks[:-1]) / 2))
         guess = resample(stage.guess, scheme, breaks)
         pieces.append(with_mode(replace(stage, guess=guess), signs))
@@ -245,14 +244,14 @@ def release_earlier(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
     Case: without it the plan of `heptagon.toml` takes 0.8 % longer.
     """
     triples = zip(stages, stages[1:], stages[2:], strict=False)
-    for k, (first, stage, following) in enumerate(triples, start=1):
-        names, remaining = stage.formation.names, following.formation.names
-        if first.phase != stage.phase or following.phase == stage.phase or stage.goal is not None:
+    for k, (first, stage, next_stage) in enumerate(triples, start=1):
+        names, remaining = stage.formation.names, next_stage.formation.names
+        if first.phase != stage.phase or next_stage.phase == stage.phase or stage.goal is not None:
             continue
-        if set(remaining) < set(names) and not following.formation.rolling:
+        if set(remaining) < set(names) and not next_stage.formation.rolling:
             rows, (Xi, sigma) = [names.index(name) for name in remaining], stage.directions
             guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
-            released = replace(following, directions=Directions(Xi[rows], sigma), guess=guess)
+            released = replace(next_stage, directions=Directions(Xi[rows], sigma), guess=guess)
             yield link(merge([*stages[:k], released, *stages[k + 1 :]]))
 
 
@@ -281,7 +280,7 @@ def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     while queue and attempts < 12 and failures < 3:  # sequences, and failures since the last gain
         neighbour = queue.pop(0)
         sequence = sign_sequence(neighbour)
-        # A vanished stage may have gained by the intervals of its neighbours alone.
+        # The cost of a vanished stage may differ by the intervals of its neighbours only.
         if sequence in visited and (sequence in recent or len(neighbour) >= len(solution.stages)):
             continue
         visited.add(sequence)
@@ -297,7 +296,7 @@ def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
             solution, queue, failures = other, list_neighbours(search, other), 0
             recent = set()
         elif _count_rolling(neighbour) > _count_rolling(solution.stages):
-            # Not better by itself, but its friction forces show which way its contacts would slide.
+            # The signs of its friction forces give further neighbours.
             queue = [*list_neighbours(search, other, at_cones=True), *queue]
     search.statistics.complete = all(sign_sequence(neighbour) in visited for neighbour in queue)
     return solution
@@ -314,7 +313,7 @@ def list_equivalent(
 
 
 def drop_vanished(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """Solution without stages that have vanished on finer intervals: their replays diverge."""
+    """Solution without stages that vanish on finer intervals, as their replays diverge."""
     other = next(list_equivalent(search, solution, list_dropped(solution.stages)), None)
     return drop_vanished(search, other) if other else solution
 
@@ -351,7 +350,7 @@ def list_neighbours(
         stage, n_c = stages[index], stages[index].formation.n_contacts
         following = [k for k, other in enumerate(stages) if other.phase > stage.phase][:1]
         for k in following if run.row < n_c else ():
-            # A contact that rolls from the next phase on slides to the end of this one.
+            # A contact that starts to roll in the next phase slides until the end of this one.
             rolling = set(formations[k].rolling) - set(formations[index].rolling)
             if stage.formation.contacts[run.row] in rolling:
                 signs = [sign for sign in signs if sign]
@@ -377,7 +376,7 @@ def list_neighbours(
         runs = list[tuple[int, ModeRun]]()
         for k, stage in enumerate(stages):
             for run in _find_least_rate_runs(stage, scheme, slow):
-                # If the contact can roll, the estimated gain counts.
+                # If the contact can roll, the estimated gain decides.
                 intervals, row = slice(run.begin, run.stop), run.row
                 middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
                 rolling = can_roll(stage.formation, middle, row)
@@ -438,13 +437,13 @@ def _find_least_rate_runs(stage: Stage, scheme: Scheme, slow: bool) -> list[Mode
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
     rates = stage.measure_rates(z, v)
     max_rate = np.abs(v[:, 2:]).max()
-    least = least_rates(stage, stage.guess.places(scheme.points))
-    least = 1.01 * least.reshape(-1, least.shape[-1])
-    active = rates < least + 1e-6 * max_rate  # of the largest rate
+    min_rates = least_rates(stage, stage.guess.places(scheme.points))
+    min_rates = 1.01 * min_rates.reshape(-1, min_rates.shape[-1])
+    active = rates < min_rates + 1e-6 * max_rate  # of the largest rate
     active &= (np.abs(rates).max(axis=1) > 1e-3 * max_rate)[:, None]
     shape = (stage.intervals, scheme.degree, -1)
     count = active.reshape(shape).sum(axis=1)
-    close = (rates < least + 1e-2 * max_rate).reshape(shape).all(axis=1)
+    close = (rates < min_rates + 1e-2 * max_rate).reshape(shape).all(axis=1)
     mask = np.repeat(close & (count > 0) if slow else count > 1, scheme.degree, axis=0)
     mask[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = False
     runs = (_find_run(flags, stage, scheme, row) for row, flags in enumerate(mask.T))

@@ -42,7 +42,7 @@ from .stage import (
 )
 from .time_motion import MotionResponse, StageMotion, make_motions
 from .time_nlp import (
-    SLIDING,
+    MIN_RATE,
     Target,
     TimeNLP,
     build_time_nlp,
@@ -556,7 +556,7 @@ def _sum(tables: Iterable[NDArray[Any]]) -> float:
 
 def measure_violations(violations: LimitViolations) -> Array:
     """Largest violation in each interval over its tolerance, shape (K,)."""
-    tolerances = (SETTINGS.violation, SETTINGS.overlap, SETTINGS.rate * SLIDING)
+    tolerances = (SETTINGS.violation, SETTINGS.overlap, SETTINGS.rate * MIN_RATE)
     parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(violations, tolerances, strict=True))
     return np.asarray(np.max(list(parts), axis=0))
 

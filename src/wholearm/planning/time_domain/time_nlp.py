@@ -1,9 +1,9 @@
 """NLP of stages in the time domain by direct collocation, for any number of degrees of freedom.
 
 A stage has one formation and fixed directions of friction, in K intervals of unknown durations h
-with d collocation points. Its equations are in the README. No row but those of collocation has h,
-so that a stage may vanish. Rates that equations keep at zero have no sign constraint, which would
-leave the solver no interior. All quantities are in the scene's units.
+with d collocation points. Its equations are in the README. Only rows of collocation contain h, so
+that the duration of a stage may be zero. Rates that equations fix at zero have no sign constraint:
+it would leave the feasible set without interior. All quantities are in the scene's units.
 
 Rate-limited torques have control points c_0 ... c_n in each interval and are continuous; with rate
 limit R
@@ -11,10 +11,10 @@ limit R
     |c_k+1 - c_k| n <= R h,
     |h c_k + lag (k (c_k - c_k-1) + (n - k) (c_k+1 - c_k))| <= limit h
 
-bound derivatives and commands throughout by their own control points. At both ends the torques hold
-the object at rest, with friction in the directions of motion. Contact forces are continuous, too:
-those of a contact that is released or gained softly vanish or set in within one interval, and a
-rolling contact that begins to slide comes to the edge of its cone.
+bound derivatives and commands between nodes by their Bernstein control points. At both ends the
+torques balance the object at rest, with friction in the directions of motion. Contact forces are
+continuous, too. They decrease to zero before a release, increase from zero after a soft gain, and
+reach the boundary of the friction cone before a rolling contact slides.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from ..nlp import (
     Kernel,
     NlpRows,
     SolverStatistics,
-    book,
+    add_cost,
     build_kernel,
     build_solver,
-    share,
+    cached_kernel,
 )
 from ..options import Objective
 from .stage import LimitViolations, Scheme, Stage, StagePoints, bernstein, make_scheme
 
-SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
+MIN_RATE = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,40 +202,40 @@ def build_time_nlp(
 ) -> TimeNLP:
     """NLP of successive stages that end at rest; its parameters are the prices of the end."""
     start_time = time.perf_counter()
-    # Regularized friction is zero at rest.
+    # Regularized friction is zero at zero velocity.
     with_statics = stages[0].formation.scene.has_slow_motors and not stages[0].smoothing
     layouts = lay_out(stages, scheme, target, with_statics)
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
     state = stages[0].guess.nodes[0].ravel()
     rows.add_entries(rows.linear(10, low=state, high=state), layouts[0].nodes[0].ravel(), 1.0)
     rows_of, controls = [], scheme.controls
-    # Weight of the duration, small beside violations.
-    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
-    # Without a cost of second differences torques ring, if their squares cost little. Case: least
-    # effort of the shipped square at a tenth of its size, where the weight of time is 4e5.
-    squares, weight = 0.0, 1.0
+    # Weight of the duration; in elastic mode small relative to violations.
+    h_costs = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
+    # A cost of second differences prevents oscillation of torques of low cost. Case: least effort
+    # of the shipped square at a tenth of its size, with a weight of time of 4e5.
+    effort, weight = 0.0, 1.0
     if target.objective is Objective.EFFORT:
-        squares, weight = 1.0, target.time_weight
+        effort, weight = 1.0, target.time_weight
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
-            join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
+            add_junction(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
         kernel, columns = effort_kernel(controls), _list_torques(layout)
-        if squares:
+        if effort:
             rows.add_copies(kernel, columns, cost=True)
-        curvature = 1e-2 * weight * stage.formation.scene.torque_limit**-2.0 - 0.1 * squares
+        curvature = 1e-2 * weight * stage.formation.scene.torque_limit**-2.0 - 0.1 * effort
         if controls > 2 and (curvature > 0).any():
             weights = {"weight": np.maximum(curvature, 0.0)}
             rows.add_copies(curvature_kernel(controls), columns, weights, cost=True)
-        cost[layout.h] = of_time.get(target.objective, 0.0)
+        cost[layout.h] = h_costs.get(target.objective, 0.0)
         cost[layout.shortfalls] = 1 / stage.intervals
     duration_row, last_stage, (end_z, end_v) = -1, stages[-1], layouts[-1].nodes[-1]
     if stages[0].periods:
         add_periods(rows, stages, layouts)
     if with_statics:
-        hold_ends(rows, stages, layouts, scheme, target.epsilon)
+        add_statics(rows, stages, layouts, scheme, target.epsilon)
     elif target.keeps_gaps and not stages[0].smoothing:
-        keep_open(rows, stages[0], layouts[0])
+        add_openings(rows, stages[0], layouts[0])
     if target.has_margin:
         cost[layouts[-1].margin[-1]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
@@ -244,8 +244,8 @@ def build_time_nlp(
     N = tangent_basis(last_stage.formation, last_stage.guess.nodes[-1, 0])
     rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
     nlp = rows.assemble(cost, end_z)
-    book(SolverStatistics(build_time=time.perf_counter() - start_time))
-    return TimeNLP(nlp, max_iter, layouts, rows, rows_of, duration_row, 1 / (squares + weight))
+    add_cost(SolverStatistics(build_time=time.perf_counter() - start_time))
+    return TimeNLP(nlp, max_iter, layouts, rows, rows_of, duration_row, 1 / (effort + weight))
 
 
 def _list_torques(layout: StageLayout) -> dict[str, Indices]:
@@ -303,7 +303,7 @@ def add_stage(
         columns = {"z": ends[:, 0], "v": ends[:, 1], "z_start": z_start}
         rows.add_copies(end_kernel(formation), columns)
 
-    # Limits of the formation that are not negative; that of the end's contact is zero there.
+    # Nonnegative limits of the formation; the end condition replaces that of the gained contact.
     end_contact = None if stage.until is None else stage.until.contact
     low = stage.list_clearances(places.ravel(), after=1 / 3).reshape(K, d, -1)
     if scheme.has_end:
@@ -322,11 +322,11 @@ def add_stage(
     # The end.
     until, (end_z, end_v) = stage.until, layout.nodes[-1]
     if last and stage.end_pose is not None:
-        until, pinned = None, np.flatnonzero(np.isfinite(stage.end_pose))
-        end_rows = rows.linear(len(pinned), low=stage.end_pose[pinned], high=stage.end_pose[pinned])
-        rows.add_entries(end_rows, end_z[pinned], 1.0)
+        until, fixed = None, np.flatnonzero(np.isfinite(stage.end_pose))
+        end_rows = rows.linear(len(fixed), low=stage.end_pose[fixed], high=stage.end_pose[fixed])
+        rows.add_entries(end_rows, end_z[fixed], 1.0)
     reversals, next_formation = _list_independent_reversals(stage), stage.next_formation
-    if stops(stage):
+    if all_rates_vanish(stage):
         reversals, next_formation = (), None
         N = tangent_basis(formation, guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], end_v, N.T)
@@ -339,13 +339,13 @@ def add_stage(
         rows.add_copies(monitor_kernel(single, ranges), {"z": end_z}, high=np.inf)
     limits, parts = add_limits(rows, stage, layout, scheme, target)
     if rate_limited:
-        add_motors(rows, stage, layout, scheme)
+        add_rate_limits(rows, stage, layout, scheme)
     balance_rows, slip_rows = points[..., balance], points[..., slip_rates]
     return StageRows(states, bases, balance_rows, slip_rows, limits, parts, monitor_rows)
 
 
 def _list_independent_reversals(stage: Stage) -> tuple[int, ...]:
-    """Rows whose rates reverse, one of each dependent set: dependent equations spoil Newton steps.
+    """Rows whose rates reverse, one of each dependent set: others make the KKT matrix singular.
 
     Dependent rows are tied, or vanish at the same place of a curve, as on the square by symmetry.
     """
@@ -358,10 +358,10 @@ def _list_independent_reversals(stage: Stage) -> tuple[int, ...]:
     return tuple(independent)
 
 
-def stops(stage: Stage) -> bool:
-    """Whether all rates are zero at the end of a stage, as enough independent rates reverse there.
+def all_rates_vanish(stage: Stage) -> bool:
+    """Whether all rates are zero at the end of a stage, by its number of independent reversals.
 
-    As many as degrees of freedom. With one they are two, since a single rate may have a zero.
+    At least two, and as many as degrees of freedom: with one a single rate may have a zero.
     """
     return len(_list_independent_reversals(stage)) >= max(2, 5 - stage.formation.n_constraints)
 
@@ -374,7 +374,7 @@ def least_rates(stage: Stage, places: Array) -> Array:
     homotopy.
     """
     contacts, mobile = stage.formation.contacts, stage.formation.n_constraints < 4
-    least = SLIDING * mobile * np.minimum(1.0, 8 * np.minimum(places, 1 - places))[..., None]
+    least = MIN_RATE * mobile * np.minimum(1.0, 8 * np.minimum(places, 1 - places))[..., None]
     if stage.smoothing:
         least = np.full(least.shape, -np.inf)
     vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
@@ -384,14 +384,14 @@ def least_rates(stage: Stage, places: Array) -> Array:
 
 def find_zero_rates(stage: Stage, last: bool) -> set[int]:
     """Rows of (contacts, joints) whose rate is zero at the end of a stage."""
-    if last or stops(stage):
+    if last or all_rates_vanish(stage):
         return set(range(stage.formation.n_contacts + 2))
     rolling = stage.next_formation.rolling if stage.next_formation else ()
     sticking = [k for k, c in enumerate(stage.formation.contacts) if c in rolling]
     return {*stage.reversals, *sticking}
 
 
-def join_stages(
+def add_junction(
     rows: NlpRows,
     pair: tuple[Stage, Stage],
     layouts: tuple[StageLayout, StageLayout],
@@ -401,7 +401,7 @@ def join_stages(
     (stage, next_stage), (layout, next_layout) = pair, layouts
     last, first = layout.nodes[-1], next_layout.nodes[0]
     if stage.formation.scene.has_slow_motors and not stage.ends_at_rest:
-        join_motors(rows, stage, layouts, scheme)
+        add_torque_junction(rows, stage, layouts, scheme)
     continuous = slice(1 if stage.ends_in_impact else 2)
     rows.add_equal(first[continuous].ravel(), last[continuous].ravel())
     rows.add_equal(next_layout.margin[0], layout.margin[-1])
@@ -433,13 +433,13 @@ def add_limits(
             slack = layout.shortfalls[:, limits.owners[row]] if elastic else layout.margin[:-1, 0]
             rows.add_entries(limit_rows, slack[:, None], weights[row])
 
-    # Normal forces by the polynomials through the points.
-    soft = bool(weights[normal].any())
+    # Normal forces: values of the polynomials through the points.
+    is_soft = bool(weights[normal].any())
     places = np.zeros(1) if scheme.has_end else np.array([0.0, 1.0])
     if stage.formation.scene.has_slow_motors:
         # Their minima are inside intervals.
         places = np.append(places, [0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
-    if soft:
+    if is_soft:
         places = np.append(places, scheme.points)
     c_n = layout.forces[:, :, limits.rows[normal].argmax(axis=1)]
     normal_rows = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
@@ -452,7 +452,7 @@ def add_limits(
         add_slack(normal_rows[..., k], row)
         side = int(np.flatnonzero(side_rows == row)[0])
         parts.append(LimitPart(side, True, normal_rows[..., k]))
-        if not soft:  # with rows at the points the forces themselves have no bounds
+        if not is_soft:  # with rows at the points the forces themselves have no bounds
             parts.append(LimitPart(side, False, c_n[..., k]))
 
     # Rows of y at the points, and bounds of one torque or joint speed alone.
@@ -460,17 +460,17 @@ def add_limits(
     single_column = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
     bounded = np.where(single_column, column - n_forces, -1)[side_rows]
     general = np.flatnonzero(~np.isin(side_rows, normal) & (bounded < 0))
-    added = rows.linear(*layout.z.shape[:2], len(general), high=np.inf)
+    y_rows = rows.linear(*layout.z.shape[:2], len(general), high=np.inf)
     for k, side in enumerate(general.tolist()):
         blocks = np.split(signs[side] * limits.rows[side_rows[side]], [n_forces, n_forces + 2])
         for unknowns, block in ((layout.forces, blocks[0]), (layout.v[..., 3:], blocks[2])):
             for n in np.flatnonzero(block):
-                rows.add_entries(added[..., k], unknowns[..., n], block[n])
+                rows.add_entries(y_rows[..., k], unknowns[..., n], block[n])
         for n in np.flatnonzero(blocks[1]):
             for i, basis in enumerate(bernstein(scheme.points, scheme.controls).T):
-                rows.add_entries(added[..., k], layout.tau[:, None, i, n], blocks[1][n] * basis)
-        add_slack(added[..., k], side_rows[side])
-        parts.append(LimitPart(side, True, added[..., k]))
+                rows.add_entries(y_rows[..., k], layout.tau[:, None, i, n], blocks[1][n] * basis)
+        add_slack(y_rows[..., k], side_rows[side])
+        parts.append(LimitPart(side, True, y_rows[..., k]))
     for side in np.flatnonzero(bounded >= 0).tolist():
         k, soft_side = int(bounded[side]), bool(weights[side_rows[side]])
         # Control points of a torque, or speeds at the points.
@@ -484,7 +484,7 @@ def add_limits(
     return limits, parts
 
 
-def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> None:
+def add_rate_limits(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> None:
     """Add the rows of one stage for rate-limited torques."""
     scene, K, n = stage.formation.scene, stage.intervals, scheme.controls - 1
     tau = layout.tau
@@ -503,7 +503,7 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
         rows.add_copies(kernel, _list_torques(layout), parameters, high=np.inf)
 
 
-def join_motors(
+def add_torque_junction(
     rows: NlpRows, stage: Stage, layouts: tuple[StageLayout, StageLayout], scheme: Scheme
 ) -> None:
     """Add rows for continuous torques, forces and accelerations between stages."""
@@ -525,7 +525,7 @@ def join_motors(
                 rows.add_copies(opening_kernel(stage.next_formation, contact), columns)
 
 
-def hold_ends(
+def add_statics(
     rows: NlpRows,
     stages: Sequence[Stage],
     layouts: Sequence[StageLayout],
@@ -534,9 +534,9 @@ def hold_ends(
 ) -> None:
     """Add static balance at both ends of a motion, and where it stops between phases.
 
-    The motion begins without acceleration and with full friction against its directions, since
-    friction may not step. With one degree of freedom it ends so, too, as along its curve. With more
-    it may stop with an acceleration, balanced by the gained contact and friction at rest.
+    The motion begins without acceleration and with friction at its bound, as it is continuous. With
+    one degree of freedom it also ends so. With more it may end with a deceleration; then the gained
+    contact and friction at rest balance the torques.
     """
     ends = list[tuple[Stage, Formation, Indices, Indices, Indices]]()
     for stage, layout in zip(stages, layouts, strict=True):
@@ -579,11 +579,11 @@ def hold_ends(
         rows.add_entries(bounds, layouts[0].tau[0, 0, joints], 1 / limit)
 
 
-def keep_open(rows: NlpRows, stage: Stage, layout: StageLayout) -> None:
-    """Add rows, linear in the first torques, for gaps closed at the start at rest: none closes.
+def add_openings(rows: NlpRows, stage: Stage, layout: StageLayout) -> None:
+    """Add rows, linear in the first torques: gaps closed at the start do not accelerate inwards.
 
-    Before the first point a gap could, and would press in the replay. Case: a pentagon of 9 cm
-    whose v4 comes to the tip of finger 2 where v2 touches finger 1.
+    Otherwise a gap could close before the first collocation point. Case: a pentagon of 9 cm whose
+    v4 comes to the tip of finger 2 where v2 touches finger 1.
     """
     formation, scene, tau = stage.formation, stage.formation.scene, layout.tau[0, 0]
     touching = np.abs(formation.evaluate_limits(stage.guess.nodes[:1, 0])[0]) < scene.touching
@@ -628,7 +628,7 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
     # Stage, period, fraction of the stage and unknowns of each interval.
     owners = [k for k, stage in enumerate(stages) for _ in stage.periods]
     periods = [period for stage in stages for period in stage.periods]
-    share = np.concatenate([stage.guess.fractions for stage in stages])
+    ratio = np.concatenate([stage.guess.fractions for stage in stages])
     h, tau = (np.concatenate([getattr(part, name) for part in layouts]) for name in ("h", "tau"))
     first: Indices | None = None  # durations of the intervals of the first full period
     for _, intervals in groupby(range(len(h)), key=lambda i: stages[owners[i]].phase):
@@ -646,7 +646,7 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
                 first = h[parts]
             for k, next_k in pairwise(parts):
                 if owners[k] == owners[next_k]:
-                    weights = np.array([share[next_k], -share[k]]) / (share[k] + share[next_k])
+                    weights = np.array([ratio[next_k], -ratio[k]]) / (ratio[k] + ratio[next_k])
                     rows.add_entries(rows.linear(1), h[[k, next_k]], weights)
                 if linear:
                     slopes = {"before": tau[k].ravel(), "after": tau[next_k].ravel()}
@@ -670,11 +670,11 @@ def find_bounds(
         if next_stage is not None and stage.ends_in_impact:
             low[layout.impulses[: next_stage.formation.n_contacts]] = 0.0
         if stage.approach is not None:
-            # A coordinate does not reach the value at which the phase ends before its end.
+            # The coordinate stays below its value at the end of the phase until then.
             row, value, side = stage.approach
             remaining = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
             start = starts.setdefault(stage.phase, stage.guess.nodes[0, 0])
-            # Phase 2 of scene 96 of seed 1128 goes on by 1.3e-4 in all.
+            # The coordinate of phase 2 of scene 96 of seed 1128 changes by 1.3e-4 only.
             distance = min(1e-3, 0.1 * abs(value - float(start[row])))
             extreme = value - side * distance * np.minimum(1.0, (2 * remaining) ** 2)
             if stage.until is not None and scheme.has_end:
@@ -727,7 +727,7 @@ def _drop_bounds(stage: Stage, rows: StageRows, scheme: Scheme, low_x: Array, lo
                 low_g[indices[0, 0]] = -np.inf
 
 
-@share
+@cached_kernel
 def point_kernel(formation: Formation, controls: int, smoothed: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
@@ -760,7 +760,7 @@ def point_kernel(formation: Formation, controls: int, smoothed: bool = False) ->
     )
 
 
-@share
+@cached_kernel
 def end_kernel(formation: Formation) -> Kernel:
     """Contacts at the end of an interval without a point there; `z_start` is z at its start."""
     x = Columns(z=5, v=5, z_start=5 * bool(formation.rolling)).make_symbols()
@@ -771,7 +771,7 @@ def end_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
-@share
+@cached_kernel
 def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
 
@@ -787,7 +787,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     return build_kernel(s, p, steps=N.T @ steps)
 
 
-@share
+@cached_kernel
 def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     """Limits of a formation."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
@@ -795,7 +795,7 @@ def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     return build_kernel(x, values=values)
 
 
-@share
+@cached_kernel
 def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
     """Second derivative of a contact's gap."""
     x = Columns(z=5, v=5, a=5).make_symbols()
@@ -806,8 +806,8 @@ def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
 def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
     """Row of the range limit of a contact that is reached near z, (5,), where `until` is gained.
 
-    None if that contact is gained by closing its gap: a pointed tip also turns onto a vertex with
-    the side of its link, in phase 1 of scene 412 of seed 1128.
+    None if that contact is gained by closing its gap. Case: phase 1 of scene 412 of seed 1128: the
+    side of a link with a pointed tip rotates onto a vertex.
     """
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     count = sum(len(build_limits(contact, formation.scene)) for contact in formation.contacts)
@@ -819,7 +819,7 @@ def find_range_end(formation: Formation, until: Until, z: Array) -> int | None:
     return next((k for k in ends if values[k] < tolerance), None)
 
 
-@share
+@cached_kernel
 def goal_kernel(
     formation: Formation,
     until: Until | None,
@@ -836,7 +836,7 @@ def goal_kernel(
     z, v = x.z, x.v
     parts: list[Expression] = [ca.SX(0, 1)]
     if until is not None and until.contact is not None:
-        # Where a contact changes its name its gap has no gradient, but the end of its range has.
+        # The gap of a renamed contact has zero gradient there; the end of its range has not.
         gap = build_features(scene).pairs[until.contact].gap
         parts.append(gap if row is None else formation.limits[row].value)
     if until is not None:
@@ -850,20 +850,20 @@ def goal_kernel(
     return build_kernel(x, goals=ca.vertcat(*parts))
 
 
-def new_rows(formation: Formation, following: Formation) -> list[int]:
-    """Constraint rows of the following formation that a formation does not have.
+def new_rows(formation: Formation, next_formation: Formation) -> list[int]:
+    """Constraint rows of the next formation that a formation does not have.
 
     A contact that continues on a neighbouring feature has the same row.
     """
-    renamed = list_renamed(formation.scene, formation.contacts, following.contacts).values()
+    renamed = list_renamed(formation.scene, formation.contacts, next_formation.contacts).values()
     contacts = {*formation.contacts, *renamed}
-    new = [i for i, c in enumerate(following.contacts) if c not in contacts]
-    rolling = [following.contacts[row] for row in following.rolling_rows]
-    n_c = following.n_contacts
-    return new + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
+    rows = [i for i, c in enumerate(next_formation.contacts) if c not in contacts]
+    rolling = [next_formation.contacts[row] for row in next_formation.rolling_rows]
+    n_c = next_formation.n_contacts
+    return rows + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
 
 
-@share
+@cached_kernel
 def effort_kernel(controls: int) -> Kernel:
     """Integral of tau^T tau over an interval, by the control points of tau."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -875,7 +875,7 @@ def effort_kernel(controls: int) -> Kernel:
     return build_kernel(x, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
-@share
+@cached_kernel
 def curvature_kernel(controls: int) -> Kernel:
     """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
@@ -884,36 +884,36 @@ def curvature_kernel(controls: int) -> Kernel:
     return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(differences**2)))
 
 
-def find_released(formation: Formation, following: Formation) -> list[int]:
-    """Indices of the contacts that the following formation does not have."""
-    return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
+def find_released(formation: Formation, next_formation: Formation) -> list[int]:
+    """Indices of the contacts that the next formation does not have."""
+    return [i for i, c in enumerate(formation.contacts) if c not in next_formation.contacts]
 
 
-@share
-def impact_kernel(formation: Formation, following: Formation) -> Kernel:
-    """Plastic impact onto the following formation: M5 (v+ - v-) = G+^T p, P+ v+ = 0.
+@cached_kernel
+def impact_kernel(formation: Formation, target: Formation) -> Kernel:
+    """Plastic impact onto a target formation: M5 (v+ - v-) = G+^T p, P+ v+ = 0.
 
-    `Xi` is for after it. Rates of gaps that open, and slack of rolling contacts, are nonnegative.
+    `Xi`: signs after it. Rates of released gaps and cone margins of rolling contacts are >= 0.
     """
-    scene, n_c = following.scene, following.n_contacts
-    x = Columns(after=5, before=5, z=5, impulses=following.n_constraints).make_symbols()
+    scene, n_c = target.scene, target.n_contacts
+    x = Columns(after=5, before=5, z=5, impulses=target.n_constraints).make_symbols()
     p = Columns(Xi=n_c).make_symbols()
-    _, P, _, A_t = following.build_constraints(x.z, x.after)
-    impulses = build_force_rows(following, P, A_t, p.Xi).T @ x.impulses
+    _, P, _, A_t = target.build_constraints(x.z, x.after)
+    impulses = build_force_rows(target, P, A_t, p.Xi).T @ x.impulses
     A = formation.function(x.z, x.after)[1]
-    rolling = list(following.rolling_rows)
-    cone_radius = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
+    rolling = list(target.rolling_rows)
+    cone_radius = ca.DM(target.friction)[rolling, :] * x.impulses[rolling, :]
     return build_kernel(
         x,
         p,
         jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - impulses,
         velocities=P @ x.after,
-        openings=A[find_released(formation, following), :] @ x.after,
+        openings=A[find_released(formation, target), :] @ x.after,
         cones=ca.vertcat(cone_radius - x.impulses[n_c:, :], cone_radius + x.impulses[n_c:, :]),
     )
 
 
-@share
+@cached_kernel
 def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     """Slack of the control points of the commands, h (1 -+ command / limit)."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -929,7 +929,7 @@ def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     return build_kernel(x, p, slack=ca.vertcat(*slack))
 
 
-@share
+@cached_kernel
 def rest_kernel(formation: Formation) -> Kernel:
     """Static balance of gravity, torques and `forces`: c_n, c_t and friction of the joints."""
     scene, n_c = formation.scene, formation.n_contacts
@@ -941,17 +941,17 @@ def rest_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, balance=balance)
 
 
-@share
+@cached_kernel
 def brake_kernel(formation: Formation) -> Kernel:
     """Decelerations of sliding contacts and joints at z' = 0."""
     x = Columns(z=5, a=5).make_symbols()
     p = Columns(Xi=formation.n_contacts, sigma=2).make_symbols()
     A_t = formation.function(x.z, ca.SX.zeros(5))[2]
-    slides = (p.Xi * (A_t @ x.a))[list(formation.rubbing_rows), :]
-    return build_kernel(x, p, brake=-ca.vertcat(slides, p.sigma * x.a[3:]))
+    decelerations = (p.Xi * (A_t @ x.a))[list(formation.rubbing_rows), :]
+    return build_kernel(x, p, brake=-ca.vertcat(decelerations, p.sigma * x.a[3:]))
 
 
-@share
+@cached_kernel
 def slope_kernel() -> Kernel:
     """Difference of the slopes of linear torques in two intervals, times both durations."""
     x = Columns(before=4, after=4, h=1, h_next=1).make_symbols()

@@ -45,10 +45,10 @@ from ..explain import (
 )
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, Plans, end_of, make_transition, plan_stops, value_of
-from .guesses import AT_REST, NEAREST_END, PROBLEM_MODES, Guess, Guesses, find_modes, list_stages
+from .guesses import NEAREST_END, PROBLEM_MODES, REST_SPEED, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
-    LEAST_INTERVALS,
     MIN_GAIN,
+    MIN_INTERVALS,
     adapt_ends,
     change_ends,
     drop_stops,
@@ -538,7 +538,7 @@ def _list_margin_guesses(
         count = sum(stage.intervals for stage in first.stages) / len({s.phase for s in fastest})
         for stage in fastest:
             phase = sum(other.guess.duration for other in fastest if other.phase == stage.phase)
-            intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
+            intervals = max(MIN_INTERVALS, round(count * stage.guess.duration / phase))
             breaks = np.linspace(0.0, 1.0, intervals + 1)
             coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
         guesses = chain(islice(guesses, 1), [Guess("a motion of least time", coarse)], guesses)
@@ -628,7 +628,7 @@ def plan_with_impacts(
     common = {name: arguments[name] for name in ("saturation", "free_plans")}
     direct = partial(plan_part, problem, block, **common)
     with_stops = partial(plan_stops, partial(direct, thorough=True), [0, *ends, len(block)], z)
-    rest_speed = AT_REST * problem.scene.scales.speed
+    rest_speed = REST_SPEED * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
     if duration is not None and fastest and max(speeds) < rest_speed:
         # Without an impact in least time there is none in a longer duration.
@@ -676,7 +676,7 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
             continue
         (z, v), scene, reason = end_of(plan), phase.formation.scene, ""
         speed = measure_speed(scene, v)
-        if speed < AT_REST * scene.scales.speed:
+        if speed < REST_SPEED * scene.scales.speed:
             speed, impact = 0.0, _impact_at_stop(phase, block[k], plan)
             reason = "no plan passes it at speed"
             if impact.violations:
