@@ -580,9 +580,8 @@ def explain_motors(
     """The error for phases under motor limits; `free` are their plans with free torques, if any."""
     settings = list[str]()
     for key, group in groupby(_list_motors(scene), key=itemgetter(0)):
-        values = dict.fromkeys(value for _, value in group)
-        if any(0 < value < math.inf for value in values):
-            texts = dict.fromkeys(f"{value:g}" for value in values)
+        texts = dict.fromkeys(f"{value:g}" for _, value in group if 0 < value < math.inf)
+        if texts:
             settings.append(f"{key} = {' and '.join(texts)} {MOTORS[key][0]}")
     if not settings:
         return error

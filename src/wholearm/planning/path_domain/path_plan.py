@@ -390,7 +390,7 @@ class PathIterate:
             margin=margin,
             multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
             cost=float(result["f"]),
-            duration=float(result["g"][-1]) * units.time if self.task.duration else 0.0,
+            duration=float(ca.sum1(result["g"][nlp.g["duration"]])) * units.time,
         )
 
     def pack(self) -> Array:

@@ -426,12 +426,12 @@ def add_limits(
     elif target.relaxation is not None:
         weights = limits.weigh(target.relaxation.key)
 
-    def add_slack(limit_rows: Indices, row: int) -> None:
-        """Add the slack of a limit's row, if it has one."""
+    def add_slack(limit_rows: Indices, row: int, intervals: Any = slice(None)) -> None:
+        """Add the slack of a limit's row in some intervals, if it has one."""
         if weights[row]:
             elastic = goal is Objective.ELASTIC
             slack = layout.shortfalls[:, limits.owners[row]] if elastic else layout.margin[:-1, 0]
-            rows.add_entries(limit_rows, slack[:, None], weights[row])
+            rows.add_entries(limit_rows, slack[intervals, None], weights[row])
 
     # Normal forces: values of the polynomials through the points.
     is_soft = bool(weights[normal].any())
@@ -448,9 +448,11 @@ def add_limits(
             rows.add_entries(normal_rows[:, i], c_n[:, j], basis[j])
     side_rows, signs, _ = limits.sides
     parts = list[LimitPart]()
+    # A margin is not one of forces that begin or vanish.
+    rising = find_zero_bounds(stage, limits) & target.has_margin
     for k, row in enumerate(normal):
-        add_slack(normal_rows[..., k], row)
         side = int(np.flatnonzero(side_rows == row)[0])
+        add_slack(normal_rows[~rising[:, side], :, k], row, ~rising[:, side])
         parts.append(LimitPart(side, True, normal_rows[..., k]))
         if not is_soft:  # with rows at the points the forces themselves have no bounds
             parts.append(LimitPart(side, False, c_n[..., k]))
