@@ -245,10 +245,7 @@ def test_unwritable_outputs(
         (["solve", "a", "--speed", "3"], "unrecognized arguments: --speed 3; see wholearm solve"),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "'ten' given; allowed are whole numbers"),
         (["solve", str(HEPTAGON), "--time-weight", "nan"], "--time-weight: nan given; allowed are"),
-        (
-            ["solve", str(HEPTAGON), "--time-weight", "2"],
-            "--time-weight: is for the objective effort",
-        ),
+        (["solve", str(HEPTAGON), "--time-weight", "2"], "--time-weight: is for the objective"),
         (["solve", str(HEPTAGON), "--cache", "found"], "--cache: is for problems with [goal]"),
         (["solve", str(HEPTAGON), "--duration", "1"], "--duration: is for the objective margin"),
         (["plot", "a.npz"], "-o/--output"),

@@ -297,6 +297,12 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
     assert read_torque_csv(str(path)).duration == t[-1]
 
 
+def test_quick_motors_cost_little_of_the_largest_margin(heptagon: Problem) -> None:
+    problems = heptagon, heptagon.with_(torque_rate_limit=5000.0)
+    free, quick = (solve(p, "margin", duration=0.42, accuracy=1e-3).value for p in problems)
+    assert 0.99 * free < quick < free * (1 + 2e-3)  # two accuracies
+
+
 @pytest.mark.parametrize("motors", [{"actuator_lag": 2e-3}, {"torque_rate_limit": 500.0}])
 def test_limited_torques_change_into_dwells(heptagon: Problem, motors: dict[str, float]) -> None:
     problem = heptagon.with_(motors | {"settle": 0.01, "speed_limit": 50.0})
