@@ -410,7 +410,8 @@ def test_command_writes_the_figure(
     monkeypatch.chdir(tmp_path)
     plan_of(HEPTAGON).save("plan.npz")
     with monkeypatch.context() as patch:
-        patch.setattr("wholearm.build_map", lambda *_, **__: chart())
+        without_glyphs = replace(chart(), problem=replace(chart().problem, name="\u540d\u524d"))
+        patch.setattr("wholearm.build_map", lambda *_, **__: without_glyphs)
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
         assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
         assert Path("map_heptagon_four_contacts.png").read_bytes()[:4] == b"\x89PNG"

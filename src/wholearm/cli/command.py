@@ -304,7 +304,10 @@ def _run(words: Sequence[str]) -> int:
         if not sys.stderr.isatty():
             _LINES.begin(os.getpid())
         try:
-            status: int = options.run(options)
+            with warnings.catch_warnings():
+                # Letters that the font does not have are boxes in figures.
+                warnings.filterwarnings("ignore", "Glyph ")
+                status: int = options.run(options)
         finally:
             _LINES.begin(0)
             READ.clear()
