@@ -391,7 +391,10 @@ def sweep(
     another sweep or anything else.
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    Range(1, 10**5).read(len(listed), "problems: COUNT")
     samples, seed = Range(0, 10**6).read(samples, "samples"), SEED.read(seed, "seed")
+    if seed and not samples:
+        raise InputError("", "seed", f"{seed} given; needs --samples")
     for check in checks:
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
