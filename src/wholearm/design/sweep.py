@@ -125,7 +125,7 @@ def _find_parameters(problem: Problem) -> dict[str, Parameter]:
 
 def _find_field(key: str) -> Field | None:
     """The declaration of a dotted key."""
-    of_end, of_scene = key.rpartition("until.")[2], key.partition("[")[0]
+    of_end, of_scene = re.sub(r".*until\.|goal(\[\d+\])?\.", "", key), key.partition("[")[0]
     return UNTIL.get(of_end) if of_end != key else _FIELDS.get(of_scene)
 
 
