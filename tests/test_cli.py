@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import HEPTAGON, IMPACTS, plan_of, problem_of, solved, text_of
+from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, solved, text_of
 from wholearm import PlanOptions, load_trajectory
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.result import describe_plan
@@ -253,6 +253,10 @@ def test_unwritable_outputs(
         (["verify", str(HEPTAGON), "a.npz", "-o", "./a.npz"], "./a.npz: cannot be written: this c"),
         (["map", str(HEPTAGON), "--plan", "a.png", "-o", "a.png"], "this command reads it"),
         (["verify", str(HEPTAGON), "a.npz", "--tolerance", "0"], "--tolerance: 0.0 given; allowed"),
+        (["bench", "queries", "--problems", "a"], "a/heptagon.toml: cannot be read: "),
+        (["bench", "corpus", "--problems", "a"], "a/box_rolling.toml: cannot be read: "),
+        (["bench", "corpus", "--only", "a*", "--problems", str(FOLDER)], "--only: 'a*' given; no"),
+        (["sweep", str(HEPTAGON), "--vary", "mass=1,2", "--seed", "1"], "--seed: 1 given; needs"),
     ],
 )
 def test_bad_arguments(folder: Path, capsys: Capture, arguments: list[str], words: str) -> None:

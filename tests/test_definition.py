@@ -420,6 +420,8 @@ def test_what_only_objects_can_say_wrongly() -> None:
         (lambda: public.verify(given, "a"), "what: 'a' given; allowed are a plan, a simulation, a"),
         (lambda: public.load(True), "path: True given; allowed: str, Path"),
         (lambda: public.sweep(given, {"mass": 1}), "vary: .* given; allowed: Mapping.str, S"),
+        (lambda: public.sweep([], {"mass": [0.2]}), "problems: COUNT: 0 given; allowed are"),
+        (lambda: public.compare(given, []), "paths: COUNT: 0 given; allowed are whole"),
         (lambda: public.design_hand(given, "mass=1:2"), "over: .* given; allowed: Sequence.str"),
         (lambda: public.TorqueProfile.join_rows([[1, 0, 0], [0, 0, 0]]), "breaks: .* increase"),
         (lambda: replace(given, epsilon=-1), "epsilon: -1 is not a number >= 0"),

@@ -359,9 +359,12 @@ def test_axes_cells_edges_and_phases_are_named(picture: Figure, chart: Formation
     assert {"v1 | v3 | v6", "v1 | v4 | v6", "v0 | v3 | v5", "v0 | e2 | v0"} <= set(shown)
     assert [text for text in shown if text.isdigit()] == ["1", "2", "3", "4", "5"]
     assert {f"edge {edge} on\nthe palm" for edge in (6, 0, 1)} <= set(shown)
+    # In a narrow window, only the phase in it has its number.
+    narrow = draw_map(build_map(chart.problem, 20, Window((-0.1, 0.1), (-0.0871, -0.087))))
+    assert [text for text in texts(narrow) if text.isdigit()] == ["4"]
     # Nothing is clipped, and labels do not overlap.
-    FigureCanvasAgg(picture)
-    check_layout(picture, 7.0)
+    for each in (picture, narrow):
+        check_layout(each, 7.0)
 
 
 def test_labels_are_inside_their_cells(picture: Figure, chart: FormationMap) -> None:
@@ -407,7 +410,8 @@ def test_command_writes_the_figure(
     monkeypatch.chdir(tmp_path)
     plan_of(HEPTAGON).save("plan.npz")
     with monkeypatch.context() as patch:
-        patch.setattr("wholearm.build_map", lambda *_, **__: chart())
+        without_glyphs = replace(chart(), problem=replace(chart().problem, name="\u540d\u524d"))
+        patch.setattr("wholearm.build_map", lambda *_, **__: without_glyphs)
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
         assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
         assert Path("map_heptagon_four_contacts.png").read_bytes()[:4] == b"\x89PNG"
@@ -507,8 +511,6 @@ def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
 
 
 NO_FFMPEG = pytest.mark.skipif(shutil.which("ffmpeg") is not None, reason="ffmpeg is there")
-
-
 MP4 = pytest.param("plan.mp4", "needs ffmpeg", marks=NO_FFMPEG)
 
 

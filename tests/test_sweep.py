@@ -68,8 +68,7 @@ def test_points_without_a_plan_say_why_and_what_would_help(box: Problem, result:
 
 
 def test_tables_say_the_same(result: Sweep) -> None:
-    rows = [*csv.DictReader(result.to_csv().splitlines())]
-    values = result.to_dict()
+    rows, values = [*csv.DictReader(result.to_csv().splitlines())], result.to_dict()
     for row, entry, kept in zip(rows, values["rows"], result.rows, strict=True):
         assert entry.items() >= {k: v for k, v in kept.items()}.items()
         assert float(row["torque_limit"]) == entry["torque_limit"]
@@ -128,6 +127,7 @@ def test_goals_and_words_are_varied_too(box: Problem, monkeypatch: pytest.Monkey
     result = sweep(goals, read_vary(["goal.flush=1,2", "goal.x=0:0.01:2"]), start=ONE)
     assert seen == [(1, 0.0), (1, 0.01), (2, 0.0), (2, 0.01)]
     assert result.reasons == {"nothing leads to x = \u2026": 4}
+    assert result.titles["goal.x"] == "goal.x [m]"
 
 
 @pytest.mark.parametrize(
@@ -189,8 +189,7 @@ def test_figures(box: Problem) -> None:
     mass, hold = np.linspace(0.1, 0.3, 5), ["constant", "linear"]
     curve = wholearm.draw_sweep(make({"mass": mass}, box)).axes
     assert len(curve) == 1 and curve[0].get_ylabel() == "time [s]"
-    (line,) = curve[0].get_lines()
-    y = np.asarray(line.get_ydata())
+    (y,) = (np.asarray(line.get_ydata()) for line in curve[0].get_lines())
     assert y[:4] == pytest.approx([1.0, 1.1, 1.2, 1.3]) and np.isnan(y[4])
     assert [text.get_text() for text in curve[0].texts] == ["too heavy"]
     words = make({"mass": mass, "control_hold": hold, "fingers_collide": [False]}, box)
@@ -222,6 +221,10 @@ def test_figures(box: Problem) -> None:
     column, bar = wholearm.draw_sweep(make(vary, box)).axes
     assert column.texts[0].get_position() == pytest.approx((0.269375, 0.0875))
     assert not bar.yaxis.get_gridlines()[0].get_visible()
+    # Nor is there a scale of values where no point has a plan.
+    for more in ({}, {"epsilon": [0.0, 1.0]}):
+        (bare,) = wholearm.draw_sweep(make({"mass": [0.29, 0.3], **more}, box)).axes
+        assert bare.get_ylabel() != "time [s]"
     samples = wholearm.draw_sweep(make({"mass": (0.001, 0.003), "epsilon": (0, 1)}, box, 4)).axes
     samples[0].figure.canvas.draw()
     assert max(len(label.get_text()) for label in samples[0].get_xticklabels()) <= 4

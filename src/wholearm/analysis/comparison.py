@@ -11,6 +11,7 @@ from itertools import zip_longest
 
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, JammingError, SimulationError, name_source
+from ..common.fields import Range
 from ..common.files import require_ending
 from ..problem.definition import Problem
 from ..problem.read import require_phases
@@ -123,6 +124,7 @@ def compare(
 
     InputError if a file cannot be read, or a trajectory is one of another problem; names the file.
     """
+    Range(1, 10**5).read(len(paths), "paths: COUNT")
     sources = [
         os.fspath(each) if isinstance(each, str | os.PathLike) else f"{type(each).__name__} {k}"
         for k, each in enumerate(paths, start=1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import fnmatch
 import json
 import math
 import os
@@ -19,7 +20,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
-from fnmatch import fnmatch
 from functools import cache, partial
 from itertools import chain, groupby, pairwise, product
 from numbers import Real
@@ -30,13 +30,13 @@ from zlib import crc32
 import numpy as np
 
 import wholearm
-from wholearm import Plan, Problem
+from wholearm import InputError, Plan, Problem
 
 from ..common.document import Table, to_plain
 from ..common.files import read_json, write_text
 from ..geometry.tracing import check_phases, trace_phases
 from ..planning.nlp import collect_costs
-from ..problem.read import build_problem
+from ..problem.read import build_problem, read_problem
 from ..problem.table import write_toml
 from ..scene.model import Finger, Friction, Polygon, Scene
 from ..search.find_route import forget_roadmaps
@@ -565,9 +565,15 @@ class Corpus(Study):
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Cases selected by `--only`."""
         self.problems, self.rounding = Path(options.problems), options.rounding
-        for case in list_cases():
-            if any(fnmatch(name_case(case), pattern) for pattern in options.only or "*"):
-                yield case
+        for name in PROBLEMS:
+            read_problem(self.problems / f"{name}.toml")
+        cases = {name_case(case): case for case in list_cases()}
+        for pattern in options.only or "*":
+            names = fnmatch.filter(cases, pattern)
+            if not names:
+                text = f"{pattern!r} given; no case matches; families: {', '.join(FAMILIES)}"
+                raise InputError("", "--only", text)
+            yield from map(cases.__getitem__, names)
 
     def limit(self, case: Case) -> float:
         """Tuning takes a thousand simulations."""

@@ -7,6 +7,7 @@ larger half of the sizes on logarithmic axes, where constant costs are negligibl
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import Any
@@ -20,7 +21,7 @@ from ..figures.style import GRID, PALETTE, open_figure
 from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
-from ..problem.read import build_problem, read_problem
+from ..problem.read import build_problem, read_problem, require_phases
 from .scenes import name_first
 from .study import Case, Findings, Row, Study, group
 
@@ -45,7 +46,8 @@ class Growth(Study):
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Problem, varied quantity, work and size."""
-        load(options.problem)
+        require_phases(load(options.problem))
+        self.run((options.problem, "intervals", "least time", 50))
         for grows, (works, sizes) in WORK.items():
             yield from product([options.problem], [grows], works, sizes)
 
@@ -62,10 +64,9 @@ class Growth(Study):
         for grows, (works, sizes) in WORK.items():
             table = []
             for work, (field, (unit, _)) in product(works, FIELDS.items()):
-                measured_sizes, values = select(rows, grows, work, field)
-                missing = [None] * (len(sizes) - len(values))
-                exponent = fit_exponent(measured_sizes, values)
-                table.append((f"{work} [{unit}]", *values, *missing, exponent))
+                costs = dict(zip(*select(rows, grows, work, field), strict=True))
+                exponent = fit_exponent([*costs], [*costs.values()])
+                table.append((f"{work} [{unit}]", *map(costs.get, sizes), exponent))
             heads = ["work", *(f"{size}:.3g" for size in sizes), "exponent:.2f"]
             parts += [f"## {grows.capitalize()}", Table(heads, table)]
         return parts, []
@@ -125,7 +126,9 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
 
 
 def fit_exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """The p of cost ~ size^p, by least squares through the larger half of the sizes."""
-    half = len(sizes) // 2
+    """The p of cost ~ size^p, by least squares through the larger half; NaN for one size."""
+    half = min(len(sizes) // 2, len(sizes) - 2)
+    if half < 0:
+        return math.nan
     x, y = (np.log(np.asarray(part, dtype=float)[half:]) for part in (sizes, costs))
     return float(np.polyfit(x, y, 1)[0])

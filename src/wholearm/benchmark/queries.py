@@ -59,6 +59,8 @@ class Queries(Study):
         objective = PlanOptions(objective=options.objective).goal.value
         ways = tuple(choice(*WAYS).read(way, "--ways") for way in options.ways)
         settings = options.problems, objective, ways
+        for name in SHIPPED:
+            read_problem(Path(options.problems, f"{name}.toml"))
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
             yield from ((kind, options.seed, k, *settings) for k in range(count))
 

@@ -247,7 +247,8 @@ problems PROBLEM ...   problem files (TOML), for one hand
 --weights W ...        weights of several problems (equal ones) in 1e-6..1e6
 --worst                minimize the largest value of several problems, not the weighted sum
 --starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
---budget N             most hands of a search, and before its first feasible one = 80 in 1..100000
+--budget N             most hands of a search after its first feasible one, and as many before
+    = 80 in 1..100000
 -o --output FILE       problem file to write (.toml; default: NAME_design.toml); of several problems
     that of the first one
 --figure FILE          also draw the path of the search (.png, .pdf, .svg)
@@ -304,7 +305,10 @@ def _run(words: Sequence[str]) -> int:
         if not sys.stderr.isatty():
             _LINES.begin(os.getpid())
         try:
-            status: int = options.run(options)
+            with warnings.catch_warnings():
+                # Letters that the font does not have are boxes in figures.
+                warnings.filterwarnings("ignore", "Glyph ")
+                status: int = options.run(options)
         finally:
             _LINES.begin(0)
             READ.clear()

@@ -137,10 +137,12 @@ class HandCost:
         feasible = next((point for point in points if math.isfinite(judge(point))), None)
         max_hands = len(hands) + budget
         for radius in RADII if feasible is not None else ():
+            if len(hands) == max_hands:
+                break
             # A new run from the best hand: models from far away are wrong along an edge.
             best = min((h for h in hands.values() if not h.reason), key=lambda hand: hand.cost)
             options = {"initial_tr_radius": radius, "final_tr_radius": FINAL_RADIUS}
-            options |= {"maxfev": max(max_hands - len(hands), 1)}
+            options |= {"maxfev": max_hands - len(hands)}
             bounds = [(-1.0, 1.0)] * len(self.choices)
             minimize(judge, best.shares, method="COBYQA", bounds=bounds, options=options)
         return [*hands.values()]

@@ -125,7 +125,7 @@ def _find_parameters(problem: Problem) -> dict[str, Parameter]:
 
 def _find_field(key: str) -> Field | None:
     """The declaration of a dotted key."""
-    of_end, of_scene = key.rpartition("until.")[2], key.partition("[")[0]
+    of_end, of_scene = re.sub(r".*until\.|goal(\[\d+\])?\.", "", key), key.partition("[")[0]
     return UNTIL.get(of_end) if of_end != key else _FIELDS.get(of_scene)
 
 
@@ -391,7 +391,10 @@ def sweep(
     another sweep or anything else.
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    Range(1, 10**5).read(len(listed), "problems: COUNT")
     samples, seed = Range(0, 10**6).read(samples, "samples"), SEED.read(seed, "seed")
+    if seed and not samples:
+        raise InputError("", "seed", f"{seed} given; needs --samples")
     for check in checks:
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}

@@ -28,7 +28,7 @@ from ..results.trajectory import Trajectory
 from .style import INK, add_line, inset, open_figure, write, write_title
 
 SIZE = (11.0, 7.9)  # in
-BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
+BOX = (1.0, 1.0, 9.15, 6.2)  # axes: left, bottom, width, height [in]
 PLACE = "place-"
 _LINE, _FREE, _AMBIGUOUS = "#9aa1ab", "#7a838f", "#AA3377"
 _FORTH, _BACK = "#0072B2", "#D55E00"
@@ -214,13 +214,17 @@ class _Drawing:
             write(self.axes, f"edge {edge} on\nthe palm", place, (4, 0), **look)
 
     def draw_paths(self) -> None:
-        """The plan, each phase with its number on or beside it."""
+        """The plan, each phase in the window with its number on or beside it."""
         corners = np.array([[self.x[0], self.phi[0]], [self.x[-1], self.phi[-1]]]) * self.scale
-        lines = [path * self.scale for path in self.paths]
+        window = tuple(corners.ravel().tolist())
+        clipped = (Path(path * self.scale).cleaned(clip=window).vertices for path in self.paths)
+        # The last vertex is that of the code STOP.
+        pieces = ((number, np.array(line)[:-1]) for number, line in enumerate(clipped, start=1))
+        lines = {number: line for number, line in pieces if len(line)}
         look: Any = {"fontsize": 8.0, "color": "white", "fontweight": "bold", "zorder": 9}
         look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}
-        places = place_discs(lines, 16.0, *corners)
-        for number, (line, place) in enumerate(zip(lines, places, strict=True), start=1):
+        places = place_discs([*lines.values()], 16.0, *corners)
+        for (number, line), place in zip(lines.items(), places, strict=True):
             add_line(self.axes, line / self.scale, zorder=3.5, **_PLAN)
             leader = np.array([find_middle(line), place]) / self.scale
             add_line(self.axes, leader, color=INK, lw=0.8, zorder=8.5)

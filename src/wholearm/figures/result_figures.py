@@ -302,7 +302,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
             axes.ticklabel_format(axis="x", scilimits=(-2, 4))
         for axes in grid.flat[len(panels) :]:
             axes.remove()
-        if contours:
+        if contours and sweep.ok:
             look: Any = {"label": sweep.label, "ticks": MaxNLocator(LEVELS)}
             bar = figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), **look)
             contours_drawn = [contour for axes in grid.flat for contour in axes.findobj(ContourSet)]
@@ -375,6 +375,8 @@ def _draw_lines(
                 places = np.full(last - first, height_of_row)
                 axes.plot(x[first:last], places, "x", color=colour, transform=transform)
             first = last
+    if not sweep.ok:
+        axes.set(yticks=[], ylabel="")
     if not single and sweep.reasons:
         bottom, top = axes.get_ylim()
         low = top - (top - bottom) / (1 - height * len(lines))
@@ -447,6 +449,8 @@ def draw_sensitivities(result: Sensitivities) -> Figure:
 @exclusive
 def draw_search(result: Design) -> Figure:
     """Draw costs and numbers of all evaluated hands, with lines for the best so far."""
+    from ..design.hand import COST_TOLERANCE
+
     choices, width = result.aim.choices, style.WIDTH - 3.4
     with style.open_figure(style.WIDTH, 3.1 + len(choices)) as figure:
         tall = float(figure.get_size_inches()[1])
@@ -456,7 +460,8 @@ def draw_search(result: Design) -> Figure:
         # Hands with much larger costs are drawn on the upper edge.
         costs_of_plans = [hand.cost for hand in result.hands if not hand.reason]
         low, high = np.quantile(costs_of_plans, [0.0, 0.95], method="higher")
-        low, high = low - 0.1 * (high - low) - 1e-9, high + 0.05 * (high - low)
+        pad = max(0.1 * (high - low), COST_TOLERANCE * abs(low), 1e-9)
+        low, high = low - pad, high + pad / 2
         for start, colour in zip(starts, style.PALETTE * len(starts), strict=False):
             hands = [hand for hand in result.hands if hand.start == start]
             costs, number = np.array([hand.cost for hand in hands]), 1 + np.arange(len(hands))
@@ -480,6 +485,8 @@ def draw_search(result: Design) -> Figure:
         for axes in (first, *others):
             axes.sharex(others[-1])
             axes.tick_params(labelbottom=axes is others[-1])
+            axes.ticklabel_format(axis="y", useOffset=False)
+        others[-1].locator_params(axis="x", integer=True, min_n_ticks=1)
         others[-1].set_xlabel("hands tried; x: no plan; on the upper edge: more")
         ends = [f"{p.problem.name}{_DOT}{p.value:.6g} {p.unit}" for p in result.plans]
         style.write_title(figure, ", ".join(ends))
