@@ -233,8 +233,7 @@ def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
     problem, plan = problem_of(path), plan_of(path, objective)
     report = verified(path, objective)
     assert report.ok, report.to_text()
-    assert abs(report.missed_by) < GOAL
-    assert len(report.phases) == len(problem.phases)
+    assert abs(report.missed_by) < GOAL and len(report.phases) == len(problem.phases)
     for phase in report.phases:
         assert phase.end_deviation is not None
         assert max(phase.end_deviation.position, phase.end_deviation.angle) < GOAL
