@@ -303,10 +303,11 @@ def plan_with_pauses(
         ends = ends if previous else [starts[0], *ends]
         return [change_torques(scene, *pair) for pair in zip(ends, starts, strict=True)]
 
-    plans = plan(duration)
+    pause, plans = 0.0, plan(duration)
     changes = list_changes(plans)
-    pause = sum(change.duration for change in changes)
-    if duration is not None and pause:
+    while duration is not None and (pauses := sum(change.duration for change in changes)) > pause:
+        # Other torques at rest may take longer to change: somewhat more is left for that.
+        pause = pauses if not pause else 1.1 * pauses
         plans = plan(duration - pause)
         changes = list_changes(plans)
     return [

@@ -501,6 +501,12 @@ class PathIterate:
             if (slack / self.data.limits.side_scales).min() < -0.05:
                 new = PathIterate.begin(replace(task, references=self.references), task.elements)
                 return replace(new, meshes=self.meshes + 1)
+        is_stalled = task.is_held or not any(map(np.any, self.violations[:2]))
+        if task.duration and np.isinf(self.violation) and is_stalled:
+            # In so long a time a motion may all but stop: shorter ones keep the same margin. Cases:
+            # the slide of a triangle in 100 s, which takes 0.3 s at least; under rate limits phase
+            # 5 of the heptagon on four contacts in 2.5 s, where torques jump at such a stop.
+            return PathIterate.begin(replace(task, duration=task.duration / 2), task.elements)
         # Cost of tightening by the violations, and of the tightening so far.
         total = self.costs + self._find_costs(*map(self.data.move_to_nodes, self.violations[:2]))
         phase_costs, costly = self._split(total), _GAP * float(total.sum()) > accuracy
@@ -517,10 +523,6 @@ class PathIterate:
             # Where elements have their least length, halving more of them gains nothing.
             if len(refined.parts[0].grid.edges) >= len(edges[0]) + task.elements // 2:
                 return refined
-        if task.duration and np.isinf(self.violation) and not any(map(np.any, self.violations[:2])):
-            # In so long a time a motion may all but stop: shorter ones keep the same margin. Case:
-            # the slide of a triangle in 100 s, which takes 0.3 s at least.
-            return PathIterate.begin(replace(task, duration=task.duration / 2), task.elements)
         return self.tighten() if self.violation > 1 else None
 
     def _remesh(self, breaks: Sequence[Array], elements: int) -> PathIterate:
