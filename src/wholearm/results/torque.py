@@ -321,11 +321,12 @@ def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
     steeper than the torques.
     """
     t, h = rows[:, 0], np.diff(rows[:, 0])[:, None]
+    allowed = rate_limit * np.where(h > 0, h, np.inf)
     # At a step the earlier row has the torques before it.
     before = np.append(h[:, 0] == 0, False)
     exact, wrong = torque.at(np.where(before, np.nextafter(t, -np.inf), t)), np.ones(1, dtype=bool)
     while wrong.any():
-        steep = (h > 0) & (np.abs(np.diff(rows[:, 1:], axis=0)) > rate_limit * h)
+        steep = np.abs(np.diff(rows[:, 1:], axis=0)) > allowed
         steep = np.pad(steep, ((1, 1), (0, 0)))
         wrong = (steep[1:] | steep[:-1]) & (rows[:, 1:] != exact)
         np.copyto(rows[:, 1:], exact, where=wrong)

@@ -348,9 +348,10 @@ class Replay(Run):
         step_time = min(self.next_step_time, self.breaks[-1])
         self.hold_end = step_time if step_time - self.t <= window else self.t
         if self.problem.scene.has_slow_motors:
-            # Rate-limited torques do not step. A motion with fading deceleration arrives early by
-            # about the cube root of its error: the old torques act until its planned end.
-            self.hold_end = max(self.hold_end, min(self.t + remaining, self.breaks[-1]))
+            # Phases are joined by ramps: steps are those of a finger without a rate limit, within
+            # phases. A motion with fading deceleration arrives early by about the cube root of its
+            # error: the old torques act until its planned end.
+            self.hold_end = min(self.t + remaining, self.breaks[-1])
             self.grace_end = self.hold_end + self.rest_window
         return Stop.PHASE
 
