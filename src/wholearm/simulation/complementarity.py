@@ -529,7 +529,7 @@ class FreeRun(Run):
             self.project_velocity(np.vstack([rows.A, rows.A_t[is_slow]]))
             rows = system.evaluate(self.z, self.v, pairs)
             closed = ClosedContacts(system, pairs, rows, self.v)
-        delay = EVENT_DELAY * system.scales.time
+        delay, least_delay = EVENT_DELAY * system.scales.time, ROUNDING_FORCE * system.scales.time
         a_free = inverse_mass * system.sum_forces(self.v, self.tau(self.t), closed.sigma)
         problem = closed.force_problem(a_free, closed.rows)
         present = self._solve(problem, closed.encode(self.modes))
@@ -546,9 +546,8 @@ class FreeRun(Run):
             # Trends decide only between modes that are consistent at present. Torques may ramp
             # within the delay: in 4 ns for a light hexagon under a rate limit.
             choice = problem.find_choice(solution)
-            if choice == problem.find_choice(present) or list_solutions(problem, choice):
-                break
-            if delay < ROUNDING_FORCE * system.scales.time:
+            is_present = choice == problem.find_choice(present)
+            if is_present or delay < least_delay or list_solutions(problem, choice):
                 break
             delay /= 10
         # At rest the last modes may be left by rounding, for others that are also at rest.
