@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -47,7 +47,8 @@ from .phase_plan import (
     share_duration,
 )
 
-LONG = 4.0  # ratio of a longest duration to the least time above which shorter ones are tried
+# Ratio of a longest duration to the least time above which plans of this duration are tried first
+LONG = 4.0
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -126,19 +127,19 @@ def plan_blocks(
     fastest = plan_each(replace(planning, options=time_options, free_ends=False), report).plans
     times = [plan.motion.duration for plan in fastest]
     duration = 2 * sum(times) if options.duration is None else options.duration
-    while True:
-        durations = share_duration(times, duration)
+    # Even slower motions hardly press harder, and their NLPs have poor local optima. Cases: phase 2
+    # of the rolling box in 20 s, which takes 0.45 s at least; the hexagon in 20 s.
+    candidates = list[Planning]()
+    for longest in dict.fromkeys([min(duration, LONG * sum(times)), duration]):
+        durations = share_duration(times, longest)
         slower = replace(planning, durations=durations, fastest=fastest)
-        # Even slower motions hardly press harder, and the NLP may not converge. Case: phase 2 of
-        # the rolling box in 2 s, which takes 0.45 s at least.
-        is_long = duration > LONG * sum(times)
         try:
-            with unadvised() if is_long else nullcontext():
-                return plan_each(slower, report)
+            with unadvised() if candidates else nullcontext():
+                candidates.append(plan_each(slower, report))
         except (InfeasibleError, SolverError):
-            if not is_long:
+            if not candidates:
                 raise
-            duration /= 2
+    return max(candidates, key=lambda each: min(plan.value for plan in each.plans))
 
 
 def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
@@ -513,21 +514,42 @@ def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
         # heptagon on four contacts with 500 N m/s, 0.067 N in place of 0.390 N.
         times = [planning.sum_durations(part.phases) or 0.0 for part in parts]
 
+        def plan_part(part: ImpactSequence, duration: float) -> Plans:
+            """Plan within a duration, or a shorter one: it need not be used up."""
+            least = sum(planning.fastest[phase.index].motion.duration for phase in part.phases)
+            failures = list[WholearmError]()
+            # Case: phase 3 of the hexagon in 2 s with a lag of 5 ms.
+            for power in (1.0, 0.5, 0.25):
+                shorter = min(duration, least * (duration / least) ** power)
+                task = part.make_task(epsilon, options, shorter)
+                try:
+                    return [*plan_curves(task, explained=False)]
+                except (InfeasibleError, SolverError) as error:
+                    failures.append(error)
+            raise failures[0]
+
         def plan_parts(duration: float | None) -> Plans:
-            plans, scale = list[Any](), (duration or 0.0) / sum(times)
+            scale = (duration or 0.0) / sum(times)
+            plans: Plans = []
             for part, time in zip(parts, times, strict=True):
                 with assign_costs(part.phases[0].number):
-                    plans += plan_curves(part.make_task(epsilon, options, scale * time))
+                    plans += plan_part(part, scale * time)
             return plans
 
-        return plan_with_pauses(planning, sequence.phases, plan_parts, sum(times))
+        # Changes may take too long in nearly the least time. Case: that heptagon with 300 N m/s in
+        # 0.55 s, where 0.526 s is the least.
+        with suppress(InfeasibleError, SolverError):
+            return plan_with_pauses(planning, sequence.phases, plan_parts, sum(times))
     # Torques between blocks keep the larger epsilon of both. Case: query 41.
     extra = [planning.extra_epsilon.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
     first_epsilon, last_epsilon = (epsilon + max(other - extra[1], 0.0) for other in extra[::2])
     previous: Curve | Array | None = None
     if planning.blocks:
         chain, plans_before = planning.blocks[-1].chain, planning.blocks[-1].plans
-        previous = chain.curves[-1] if chain else plans_before[-1].end_torques[1]
+        if chain and options.goal is not Objective.MARGIN:
+            previous = chain.curves[-1]
+        else:
+            previous = plans_before[-1].end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     next_curve: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):
@@ -544,7 +566,10 @@ def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
             least = last_epsilon if part is parts[-1] else epsilon
             ending = choose_junction(last, after, last.end, least, part.phases[-1].number + 1)
         pins = junction.start_force if junction else None, ending.end_force if ending else None
-        task = replace(part.make_task(epsilon, options), pins=pins)
+        duration = planning.sum_durations(part.phases)
+        if duration is not None and junction is not None:
+            duration -= junction.change.duration
+        task = replace(part.make_task(epsilon, options, duration), pins=pins)
         with assign_costs(number):
             plan: Plans = [*plan_curves(task)]
         if junction is not None:
