@@ -127,8 +127,8 @@ def plan_blocks(
     fastest = plan_each(replace(planning, options=time_options, free_ends=False), report).plans
     times = [plan.motion.duration for plan in fastest]
     duration = 2 * sum(times) if options.duration is None else options.duration
-    # Even slower motions hardly press harder, and their NLPs have poor local optima. Cases: phase 2
-    # of the rolling box in 20 s, which takes 0.45 s at least; the hexagon in 20 s.
+    # Even slower motions hardly press harder, and their NLPs may not converge. Case: phase 2 of the
+    # rolling box in 20 s, which takes 0.45 s at least.
     candidates = list[Planning]()
     for longest in dict.fromkeys([min(duration, LONG * sum(times)), duration]):
         durations = share_duration(times, longest)
