@@ -322,6 +322,8 @@ class PathIterate:
     multipliers: dict[str, Array] = field(default_factory=dict)  # empty at a point to start from
     cost: float = np.inf  # in the units of the NLP
     duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
+    # (N + 1, 5): what the solution uses at the nodes of the limits that `factors` scale; 1 for b
+    usage: Array | float = 1.0
     meshes: int = 0  # before this one
     before: PathIterate | None = None  # the solution on the mesh before
 
@@ -391,7 +393,19 @@ class PathIterate:
             multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
             cost=float(result["f"]),
             duration=float(ca.sum1(result["g"][nlp.g["duration"]])) * units.time,
+            usage=self._find_usage(result["g"].full()[:, 0]),
         )
+
+    def _find_usage(self, g: Array) -> Array:
+        """Torque rates and commands of a solution over their limits, `usage`."""
+        nlp, data = self.nlp, self.data
+        usage = np.ones((len(data.grid.s), 5))
+        torque = data.torque_limit / self.units.of(data.limits)[list(nlp.shape.torques)]
+        for first, name, limits in ((1, "rates", np.ones(2)), (3, "commands", torque)):
+            joints = list(getattr(nlp.shape, name))
+            values = np.abs(g[nlp.g[name]]).reshape(len(joints), len(usage))
+            usage[:, [first + joint for joint in joints]] = (values / limits[joints, None]).T
+        return usage
 
     def pack(self) -> Array:
         """Unknowns of the NLP, in its units, of the motion to start from.
@@ -565,7 +579,11 @@ class PathIterate:
         absorbed = np.where(excess > 0, spare, 0.0)
         added, less = (1.05 * data.move_to_nodes(violation) for violation in (excess, over))
         limits = np.maximum(current.limits, data.move_to_nodes(absorbed)) + added
-        tighter = Tightening(limits, current.excess + added, current.factors * (1 - less), factor)
+        # So it is with factors. Case: least effort of phase 4 of the heptagon with 50 N m/s.
+        usage = np.broadcast_to(self.usage, less.shape)
+        spared = data.move_to_nodes(np.where(over > 0, np.maximum(usage[k], usage[k + 1]), 0.0))
+        factors = np.where(spared > 0, np.minimum(current.factors, spared), current.factors)
+        tighter = Tightening(limits, current.excess + added, factors * (1 - less), factor)
         return replace(self, tightening=tighter)
 
     @cached_property
