@@ -100,8 +100,8 @@ def test_a_kink_has_the_derivative_with_more(box: Problem) -> None:
         return [("1", "", 1 + max(2 * more, -3 * more))], z
 
     ways = [("differences", 1e-3, evaluate(box, box.start)[0], evaluate)]
-    row = sensitivities._find_one(box, Objective.TIME, ["1"], ways, mass)
-    assert row.derivative == pytest.approx(2.0)
+    row = sensitivities._find_one(box, Objective.TIME, ["1"], ways, 1e-3, mass)
+    assert (row.derivative, row.error) == pytest.approx((2.0, 1.0 / mass.value))
     assert row.note == "with more only: with less the derivative is -3"
 
 

@@ -73,6 +73,7 @@ class Sensitivity:
     limit: str  # limit with the largest term; empty if unknown
     method: str  # {"multipliers", "differences"}
     note: str = ""  # reason of a one-sided derivative
+    error: float = 0.0  # of the derivative, by the estimated errors of plans, for differences
 
     @property
     def percent(self) -> float:
@@ -93,7 +94,7 @@ class Sensitivities(Result):
 
     @property
     def document(self) -> Document:
-        """A ranked table, and reasons of one-sided derivatives."""
+        """A ranked table, reasons of one-sided derivatives, and derivatives within errors."""
         least = fixed(max((abs(row.percent) for row in self.rows), default=0.0), 4)
         heads = ["number", "value:.6g", "", f"d({self.objective})/d(number):.4g"]
         heads += [f"1 % more [{self.unit}]:{least}", "acts through", "by"]
@@ -105,6 +106,9 @@ class Sensitivities(Result):
             for row in self.rows
         ]
         notes = [f"{row.name}: {row.note}" for row in self.rows if row.note]
+        unsure = [row.name for row in self.rows if row.error > abs(row.derivative)]
+        if unsure:
+            notes.append(f"within the errors of the plans: {', '.join(unsure)}")
         title = f"{self.problem}: {self.objective} = {self.value:.6g} {self.unit}"
         return Document(title, parts=[Table(heads, rows), *notes])
 
@@ -354,7 +358,8 @@ def find_sensitivities(
         names_of |= dict.fromkeys(range(first, last + 1), part)
     methods.append(("differences", WIDE_STEP, list_values(planning), solve))
     progress(f"{len(parameters)} numbers")
-    tasks = [partial(_find_one, problem, goal, parts, methods, p) for p in parameters]
+    error = max(plan.error for plan in planning.plans)
+    tasks = [partial(_find_one, problem, goal, parts, methods, error, p) for p in parameters]
     rows = run_tasks(tasks, jobs)
     rows.sort(key=lambda row: -abs(row.percent) if math.isfinite(row.percent) else 0.0)
     value = combine(goal, [plan.value for plan in planning.plans])
@@ -362,9 +367,17 @@ def find_sensitivities(
 
 
 def _find_one(
-    problem: Problem, goal: Objective, parts: Sequence[str], methods: Sequence[Method], p: Parameter
+    problem: Problem,
+    goal: Objective,
+    parts: Sequence[str],
+    methods: Sequence[Method],
+    plan_error: float,
+    p: Parameter,
 ) -> Sensitivity:
-    """The sensitivity to one number, by the first method that can evaluate one of its sides."""
+    """The sensitivity to one number, by the first method that can evaluate one of its sides.
+
+    `plan_error` is the largest estimated relative error of the value.
+    """
     size, failure = max(abs(p.value), LEAST_SIZE * p.scale), ""
     values_of = p.name, p.value, p.unit
     for method, step, nominal, evaluate in methods:
@@ -396,6 +409,7 @@ def _find_one(
             for _, limit, value in terms:
                 effects[limit] = effects.get(limit, 0.0) + sign * value
         limit = max(effects, key=lambda name: abs(effects[name])) if any(slopes) else ""
-        return Sensitivity(*values_of, slope, tuple(slopes), limit, method, note)
+        uncertainty = plan_error * abs(totals[2] / (high - low)) if method == "differences" else 0.0
+        return Sensitivity(*values_of, slope, tuple(slopes), limit, method, note, uncertainty)
     note = f"neither with more nor with less: {failure}"
     return Sensitivity(*values_of, math.nan, (math.nan,) * len(parts), "", methods[-1][0], note)
