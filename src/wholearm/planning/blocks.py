@@ -292,7 +292,7 @@ def plan_with_pauses(
     plan: Callable[[float | None], Plans],
     duration: float | None,
 ) -> Plans:
-    """Plans of a block in the time domain with pauses, by `plan` for a longest duration [s]."""
+    """Plans of a block with pauses, by `plan` for a longest duration [s] of the motions."""
     from .dwell import add_pause
 
     previous, scene = planning.plans[-1:], planning.problem.scene
@@ -501,6 +501,40 @@ class ImpactSequence:
         return impacts
 
 
+def plan_margin_at_rest(planning: Planning, sequence: ImpactSequence) -> Plans:
+    """Plan for the largest margin under rate limits, with torques at rest chosen by the NLPs.
+
+    Those of the fastest changes would limit it. Case: the heptagon on four contacts with 500 N m/s,
+    0.067 N in place of 0.390 N.
+    """
+    epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
+    times = [planning.sum_durations(part.phases) or 0.0 for part in parts]
+
+    def plan_part(part: ImpactSequence, duration: float) -> Plans:
+        """Plan within a duration, or a shorter one: it need not be used up."""
+        least = sum(planning.fastest[phase.index].motion.duration for phase in part.phases)
+        failures = list[WholearmError]()
+        # Case: phase 3 of the hexagon in 2 s with a lag of 5 ms.
+        for power in (1.0, 0.5, 0.25):
+            shorter = min(duration, least * (duration / least) ** power)
+            task = part.make_task(epsilon, options, shorter)
+            try:
+                return [*plan_curves(task, explained=False)]
+            except (InfeasibleError, SolverError) as error:
+                failures.append(error)
+        raise failures[0]
+
+    def plan_parts(duration: float | None) -> Plans:
+        scale = (duration or 0.0) / sum(times)
+        plans: Plans = []
+        for part, time in zip(parts, times, strict=True):
+            with assign_costs(part.phases[0].number):
+                plans += plan_part(part, scale * time)
+        return plans
+
+    return plan_with_pauses(planning, sequence.phases, plan_parts, sum(times))
+
+
 def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
     """Plan the parts of a block along curves under rate limits, with pauses between them.
 
@@ -510,36 +544,10 @@ def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
 
     epsilon, options, parts = planning.problem.epsilon, planning.options, sequence.split()
     if options.goal is Objective.MARGIN:
-        # The fastest changes would limit it: the NLP chooses the torques at rest. Case: the
-        # heptagon on four contacts with 500 N m/s, 0.067 N in place of 0.390 N.
-        times = [planning.sum_durations(part.phases) or 0.0 for part in parts]
-
-        def plan_part(part: ImpactSequence, duration: float) -> Plans:
-            """Plan within a duration, or a shorter one: it need not be used up."""
-            least = sum(planning.fastest[phase.index].motion.duration for phase in part.phases)
-            failures = list[WholearmError]()
-            # Case: phase 3 of the hexagon in 2 s with a lag of 5 ms.
-            for power in (1.0, 0.5, 0.25):
-                shorter = min(duration, least * (duration / least) ** power)
-                task = part.make_task(epsilon, options, shorter)
-                try:
-                    return [*plan_curves(task, explained=False)]
-                except (InfeasibleError, SolverError) as error:
-                    failures.append(error)
-            raise failures[0]
-
-        def plan_parts(duration: float | None) -> Plans:
-            scale = (duration or 0.0) / sum(times)
-            plans: Plans = []
-            for part, time in zip(parts, times, strict=True):
-                with assign_costs(part.phases[0].number):
-                    plans += plan_part(part, scale * time)
-            return plans
-
-        # Changes may take too long in nearly the least time. Case: that heptagon with 300 N m/s in
-        # 0.55 s, where 0.526 s is the least.
+        # Its changes may take too long in nearly the least time. Case: the heptagon on four
+        # contacts with 300 N m/s in 0.55 s, where 0.526 s is the least.
         with suppress(InfeasibleError, SolverError):
-            return plan_with_pauses(planning, sequence.phases, plan_parts, sum(times))
+            return plan_margin_at_rest(planning, sequence)
     # Torques between blocks keep the larger epsilon of both. Case: query 41.
     extra = [planning.extra_epsilon.get(len(planning.blocks) + k, 0.0) for k in (-1, 0, 1)]
     first_epsilon, last_epsilon = (epsilon + max(other - extra[1], 0.0) for other in extra[::2])
