@@ -63,8 +63,7 @@ class Range:
 
     def read(self, raw: Any, key: str) -> Any:
         """The value as int or float, or an `InputError` that names `key`."""
-        # NumPy integers are not instances of int.
-        value = raw.item() if isinstance(raw, Real) and hasattr(raw, "item") else raw
+        value = _unbox(raw)
         if text := self.find_fault(value):
             raise InputError("", key, text)
         return value if self.is_integer else float(value)
@@ -102,6 +101,12 @@ class Range:
                 raise InputError("", key, f"{value:g} given; allowed are {text}{meaning}")
 
 
+def _unbox(value: Any) -> Any:
+    """A scalar of NumPy, which is no int and no bool, as one of Python; others as they are."""
+    is_scalar = hasattr(value, "item") and not hasattr(value, "__len__")
+    return value.item() if is_scalar else value
+
+
 def choice(*words: str) -> FieldKind:
     """One of several words, or the enumeration member with this value."""
 
@@ -119,8 +124,7 @@ def _read_type(kind: type, text: str) -> Callable[[Any, str], Any]:
     """Reader of values of one type; messages are the value followed by `text`."""
 
     def read(value: Any, key: str) -> Any:
-        if hasattr(value, "dtype") and hasattr(value, "item") and not value.ndim:
-            value = value.item()
+        value = _unbox(value)
         if not isinstance(value, kind):
             raise InputError("", key, f"{value!r} {text}")
         return value
