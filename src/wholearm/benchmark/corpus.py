@@ -568,12 +568,15 @@ class Corpus(Study):
         for name in PROBLEMS:
             read_problem(self.problems / f"{name}.toml")
         cases = {name_case(case): case for case in list_cases()}
+        selected = set[str]()
         for pattern in options.only or "*":
             names = fnmatch.filter(cases, pattern)
             if not names:
                 text = f"{pattern!r} given; no case matches; families: {', '.join(FAMILIES)}"
                 raise InputError("", "--only", text)
-            yield from map(cases.__getitem__, names)
+            selected.update(names)
+        # Each once, and long ones first.
+        yield from (case for name, case in cases.items() if name in selected)
 
     def limit(self, case: Case) -> float:
         """Tuning takes a thousand simulations."""
