@@ -47,8 +47,7 @@ from .phase_plan import (
     share_duration,
 )
 
-# Ratio of a longest duration to the least time above which plans of this duration are tried first
-LONG = 4.0
+LONG = 4.0  # multiple of the least time within which longer durations are planned, too
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -554,10 +553,9 @@ def plan_rate_limited(planning: Planning, sequence: ImpactSequence) -> Plans:
     previous: Curve | Array | None = None
     if planning.blocks:
         chain, plans_before = planning.blocks[-1].chain, planning.blocks[-1].plans
-        if chain and options.goal is not Objective.MARGIN:
-            previous = chain.curves[-1]
-        else:
-            previous = plans_before[-1].end_torques[1]
+        # Of the largest margin the last torques may be those of an NLP.
+        free_end = chain if options.goal is not Objective.MARGIN else None
+        previous = free_end.curves[-1] if free_end else plans_before[-1].end_torques[1]
     following = find_following(planning.problem, sequence.phases)
     next_curve: Curve | Formation | None = following[0].formation if following else None
     if following and runs_along_curves(following, options):

@@ -322,8 +322,6 @@ class PathIterate:
     multipliers: dict[str, Array] = field(default_factory=dict)  # empty at a point to start from
     cost: float = np.inf  # in the units of the NLP
     duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
-    # (N + 1, 5): what the solution uses at the nodes of the limits that `factors` scale; 1 for b
-    usage: Array | float = 1.0
     meshes: int = 0  # before this one
     before: PathIterate | None = None  # the solution on the mesh before
 
@@ -393,13 +391,16 @@ class PathIterate:
             multipliers={f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
             cost=float(result["f"]),
             duration=float(ca.sum1(result["g"][nlp.g["duration"]])) * units.time,
-            usage=self._find_usage(result["g"].full()[:, 0]),
         )
 
-    def _find_usage(self, g: Array) -> Array:
-        """Torque rates and commands of a solution over their limits, `usage`."""
+    def find_usage(self) -> Array:
+        """Torque rates and commands at the nodes over their limits, (N + 1, 5) as of `factors`.
+
+        The largest b counts as used.
+        """
         nlp, data = self.nlp, self.data
-        usage = np.ones((len(data.grid.s), 5))
+        g = nlp.solver.function.get_function("nlp_g")(self.pack(), self.find_parameters())
+        g, usage = g.full()[:, 0], np.ones((len(data.grid.s), 5))
         torque = data.torque_limit / self.units.of(data.limits)[list(nlp.shape.torques)]
         for first, name, limits in ((1, "rates", np.ones(2)), (3, "commands", torque)):
             joints = list(getattr(nlp.shape, name))
@@ -519,8 +520,8 @@ class PathIterate:
             if (slack / self.data.limits.side_scales).min() < -0.05:
                 new = PathIterate.begin(replace(task, references=self.references), task.elements)
                 return replace(new, meshes=self.meshes + 1)
-        is_stalled = task.is_held or not any(map(np.any, self.violations[:2]))
-        if task.duration and np.isinf(self.violation) and is_stalled:
+        only_stalls = not any(map(np.any, self.violations[:2]))
+        if task.duration and np.isinf(self.violation) and (task.is_held or only_stalls):
             # In so long a time a motion may all but stop: shorter ones keep the same margin. Cases:
             # the slide of a triangle in 100 s, which takes 0.3 s at least; under rate limits phase
             # 5 of the heptagon on four contacts in 2.5 s, where torques jump at such a stop.
@@ -579,10 +580,12 @@ class PathIterate:
         absorbed = np.where(excess > 0, spare, 0.0)
         added, less = (1.05 * data.move_to_nodes(violation) for violation in (excess, over))
         limits = np.maximum(current.limits, data.move_to_nodes(absorbed)) + added
-        # So it is with factors. Case: least effort of phase 4 of the heptagon with 50 N m/s.
-        usage = np.broadcast_to(self.usage, less.shape)
-        spared = data.move_to_nodes(np.where(over > 0, np.maximum(usage[k], usage[k + 1]), 0.0))
-        factors = np.where(spared > 0, np.minimum(current.factors, spared), current.factors)
+        factors = current.factors
+        if data.grid.held:
+            # So it is with factors. Case: least effort of phase 4 of the heptagon with 50 N m/s.
+            usage = self.find_usage()
+            spared = data.move_to_nodes(np.where(over > 0, np.maximum(usage[k], usage[k + 1]), 0.0))
+            factors = np.where(spared > 0, np.minimum(factors, spared), factors)
         tighter = Tightening(limits, current.excess + added, factors * (1 - less), factor)
         return replace(self, tightening=tighter)
 
